@@ -222,7 +222,8 @@ def rest(sender: Sender, q: Array, answers: socket.socket) -> None:
     while newest(answers) is None:
         if time.monotonic() > until_s:
             raise SystemExit(
-                "the tracker does not answer; run hilstar serve and hilstar tracker by hand to see why"
+                "the tracker does not answer; run hilstar serve and hilstar tracker by hand to"
+                " see why"
             )
         sender.send(q, np.zeros(3))
         time.sleep(STEP_S)

@@ -75,7 +75,8 @@ def main(endpoint: str, keys: str, seconds: str = "10") -> int:
         socket = open_socket(context, endpoint, Path(keys))
         if socket is None:
             print(
-                f"{endpoint}: nobody listens; start hilstar, and put client.key into its allowed_clients",
+                f"{endpoint}: nobody listens; start hilstar, and put client.key into its"
+                " allowed_clients",
                 file=sys.stderr,
             )
             return 1

@@ -51,7 +51,8 @@ def profile(t_s: float) -> tuple[float, float]:
 def main() -> None:
     """Write the log to stdout."""
     print(
-        "# made by make_slew.py: 20 degrees from rest to rest in 20 s; q_icrs_to_cam, rates of the camera in rad/s"
+        "# made by make_slew.py: 20 degrees from rest to rest in 20 s; q_icrs_to_cam, rates of the"
+        " camera in rad/s"
     )
     print("t_s,qw,qx,qy,qz,rx,ry,rz")
     for k in range(round((SLEW_S + 2 * REST_S) * SAMPLES_HZ) + 1):

@@ -72,7 +72,8 @@ def _c_struct(packet: Packet) -> str:
 def _c_encode(packet: Packet) -> str:
     out = [f"/** Writes {packet.size} bytes to `out`. */"]
     out.append(
-        f"static inline size_t hilstar_encode_{packet.name}(const hilstar_{packet.name} *in, uint8_t *out)"
+        f"static inline size_t hilstar_encode_{packet.name}(const hilstar_{packet.name} *in,"
+        " uint8_t *out)"
     )
     out += ["{", *_c_index(packet)]
     for f in packet.fields:

@@ -126,11 +126,13 @@ def _packet(name: str, entry: dict[str, Any], version: int) -> Packet:
         offset += fields[-1].size
     if offset != entry["size_bytes"]:
         raise SystemExit(
-            f"packet.{name}: the fields have {offset} bytes, but size_bytes is {entry['size_bytes']}"
+            f"packet.{name}: the fields have {offset} bytes, but size_bytes is"
+            f" {entry['size_bytes']}"
         )
     head = [(f.name, f.type, f.value) for f in fields[:2]]
     if head != [("version", "u8", version), ("kind", "u8", entry["kind"])] or not fields[-1].crc:
         raise SystemExit(
-            f"packet.{name}: the first fields must be version and kind, each with its value, and the last the CRC"
+            f"packet.{name}: the first fields must be version and kind, each with its value, and"
+            " the last the CRC"
         )
     return Packet(name, entry["kind"], offset, entry["sender"], entry["meaning"], tuple(fields))

@@ -21,7 +21,8 @@ def main() -> NoReturn:
         if path is None:
             raise
         print(
-            f"hilstar: {path}: this compiled module is damaged ({error}), as by a full disk; delete the file",
+            f"hilstar: {path}: this compiled module is damaged ({error}), as by a full disk; delete"
+            " the file",
             file=sys.stderr,
         )
         sys.exit(WRONG_FILE)

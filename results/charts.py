@@ -78,7 +78,10 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
                 1 / (60e-6 + 1.8e-3 * case_s / seconds),
             )
             paper[words].append(min(limits))
-    title = "Frames grow with stars up to the cap on pixels, reports with hours; one scheduler feeds 1000 cores by longer tasks"
+    title = (
+        "Frames grow with stars up to the cap on pixels, reports with hours; one scheduler feeds"
+        " 1000 cores by longer tasks"
+    )
     with chart(DOCS / "scale.svg", title, 3, 2, share_x=False) as panels:
         stars, pixels, memory, workers, packets, hours = panels
         stars.plot(*points("stars", "time"), "o-", color=RED)
@@ -139,10 +142,14 @@ def draw_tracker(rows: list[dict[str, str]]) -> None:
     names = [f"{row['kind'].replace('_', ' ')}, {row['method']}" for row in rows]
     ms = [float(row["median_ms"]) for row in rows]
     own = {row["kind"]: float(row["median_ms"]) for row in rows if row["method"] == "hilstar"}
-    finding = f"The virtual tracker takes {own['exposure']:.0f} ms for an exposure, {own['case']:.0f} ms for a campaign's case"
+    finding = (
+        f"The virtual tracker takes {own['exposure']:.0f} ms for an exposure, {own['case']:.0f} ms"
+        " for a campaign's case"
+    )
     note = (
-        "Medians of processor time, ms, in turn. 1024 x 1024 px of the demo's tracker, all noise; peers have"
-        " hilstar's expected image or DN. verify: one field. First frame: a process from exec to its end, 1920 x 1080."
+        "Medians of processor time, ms, in turn. 1024 x 1024 px of the demo's tracker, all noise;"
+        " peers have hilstar's expected image or DN. verify: one field. First frame: a process from"
+        " exec to its end, 1920 x 1080."
     )
     with chart(DOCS / "tracker_speed.svg", finding, note=note, height_inch=3.6) as (axes,):
         value_bars(axes, names, ms, [colours[row["method"]] for row in rows])

@@ -297,7 +297,10 @@ def over_frames_table() -> str:
 
     def name(panel: str) -> str:
         row = at[panel, "1"]
-        return f"{panel}, {float(row['mag_under_white']):g} mag under white: {figure(float(row['steps']))} steps of light"
+        return (
+            f"{panel}, {float(row['mag_under_white']):g} mag under white:"
+            f" {figure(float(row['steps']))} steps of light"
+        )
 
     panels = dict.fromkeys(row["panel"] for row in rows)
     head = ["", *(f"{count} frames" if count != "1" else "1 frame" for count in frames)]

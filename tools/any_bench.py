@@ -123,7 +123,10 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
 def draw(path: Path, rows: list[dict[str, Any]], note: str = "") -> None:
     """Ratio of pixels against the share of the screen that is seen, coloured by outcome."""
     good = sum(row["outcome"] in GOOD_OUTCOMES for row in rows)
-    finding = f"{good} of {len(rows)} benches by chance are calibrated and verified, or are refused for a reason"
+    finding = (
+        f"{good} of {len(rows)} benches by chance are calibrated and verified, or are refused for a"
+        " reason"
+    )
     note = f"{note} A share above 100 %: the tracker's field is larger than the screen.".strip()
     with chart(path, finding, height_inch=4.6, note=note) as (axes,):
         for outcome in OUTCOMES:

@@ -69,7 +69,8 @@ def main() -> int:
             ]
             shots = [tracker.expose(view, None) for view in views]
             print(
-                "| fitted by | stars | in all | distortion | colour | rest |\n| --- | --- | --- | --- | --- | --- |"
+                "| fitted by | stars | in all | distortion | colour | rest |\n| --- | --- | --- |"
+                " --- | --- | --- |"
             )
             for way, keys in WAYS.items():
                 solver = CentroidSolver(Centroiding(**keys), folder)

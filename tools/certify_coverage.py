@@ -105,7 +105,8 @@ def main() -> None:
         new = rows_of(kind, asked.benches, found)
         for row in new:
             print(
-                f"  {row[1]:14}{row[2]:14}{row[5]:>6} % ({row[6]} to {row[7]}), ratio {row[8]}, not assessed {row[4]}",
+                f"  {row[1]:14}{row[2]:14}{row[5]:>6} % ({row[6]} to {row[7]}), ratio {row[8]}, not"
+                f" assessed {row[4]}",
                 flush=True,
             )
         rows += new

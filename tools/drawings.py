@@ -128,7 +128,8 @@ def chain() -> str:
 def bench() -> str:
     """first-day.md: the bench seen from the side, with the README's distances."""
     d = Drawing(
-        "The bench from the side: monitor, one focal length, collimating lens, parallel light, star tracker",
+        "The bench from the side: monitor, one focal length, collimating lens, parallel light, star"
+        " tracker",
         320,
     )
     d.line((20, 36), (740, 36), (740, 236), (20, 236), (20, 36), kind="line dash")
@@ -160,7 +161,8 @@ def bench() -> str:
 def packet_life() -> str:
     """attitude-in.md: what happens to a packet until it is light, and what each stage takes."""
     d = Drawing(
-        "A packet's life: sent, arrived, checked, on the timeline, predicted, drawn, swapped, light",
+        "A packet's life: sent, arrived, checked, on the timeline, predicted, drawn, swapped,"
+        " light",
         250,
     )
     steps = (
@@ -192,7 +194,8 @@ def packet_life() -> str:
         6,
         742,
         214,
-        "age at light: from t_ns to the light, less the minimum delay of the road, which a one-way stream cannot measure",
+        "age at light: from t_ns to the light, less the minimum delay of the road, which a one-way"
+        " stream cannot measure",
     )
     return d.svg()
 
@@ -200,7 +203,8 @@ def packet_life() -> str:
 def heads() -> str:
     """heads.md: several heads, one attitude."""
     d = Drawing(
-        "One source of the body's attitude; a process, a monitor, a ledger and a page for each head",
+        "One source of the body's attitude; a process, a monitor, a ledger and a page for each"
+        " head",
         250,
     )
     d.box((8, 92), (136, 66), "Body’s attitude\none sender,\none clock")
@@ -225,7 +229,8 @@ def heads() -> str:
 def separated() -> str:
     """error-budget.md: what an answer's error is separated into."""
     d = Drawing(
-        "What the error of an answer is separated into: clock, bias, field-of-view error, pixel error, noise",
+        "What the error of an answer is separated into: clock, bias, field-of-view error, pixel"
+        " error, noise",
         268,
     )
     d.box((4, 92), (166, 74), "Answer less command\nat the same time,\nas a rotation vector")
@@ -250,7 +255,8 @@ def separated() -> str:
 def theory_bench() -> str:
     """theory-bench.md: the bench with its frames' axes and pixels."""
     d = Drawing(
-        "The bench and its frames: monitor pixels, cam and mon axes, the tracker's pixels, the sky at infinity",
+        "The bench and its frames: monitor pixels, cam and mon axes, the tracker's pixels, the sky"
+        " at infinity",
         372,
     )
     d.text(20, 24, "monitor", "head")
@@ -311,7 +317,8 @@ def theory_bench() -> str:
 def theory_light() -> str:
     """theory-light.md: from a catalogue's magnitude to the light that the tracker receives."""
     d = Drawing(
-        "The light chain: magnitude and colour, electron rate, sprite, linear image, level, code, light, tracker",
+        "The light chain: magnitude and colour, electron rate, sprite, linear image, level, code,"
+        " light, tracker",
         300,
     )
     rows = (
@@ -359,7 +366,8 @@ def theory_light() -> str:
 def theory_frame() -> str:
     """theory-frame.md: packets, clocks and frames on one axis of time."""
     d = Drawing(
-        "The frame loop in time: packets, offset, prediction, drawing, swap, scan-out, light, over three refreshes",
+        "The frame loop in time: packets, offset, prediction, drawing, swap, scan-out, light, over"
+        " three refreshes",
         392,
     )
     left, period = 128.0, 190.0

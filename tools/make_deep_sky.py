@@ -107,7 +107,8 @@ def main(catalogues: list[Path], target: Path, faintest_v_mag: float) -> None:
                     images.append(image_of(row, float(mag)))
     fits.HDUList(images).writeto(target, overwrite=True)
     print(
-        f"{target}: {len(images) - 1} objects to V = {faintest_v_mag:g}, {target.stat().st_size} bytes"
+        f"{target}: {len(images) - 1} objects to V = {faintest_v_mag:g}, {target.stat().st_size}"
+        " bytes"
     )
 
 

@@ -61,7 +61,8 @@ def main(
         facts = read_facts(path, columns["hip"])
     if (rows_read, len(columns["hip"])) != (ROWS_READ, ROWS_KEPT):
         raise InputError(
-            f"{path}: {rows_read} rows, {len(columns['hip'])} usable; wanted {ROWS_READ}, {ROWS_KEPT}"
+            f"{path}: {rows_read} rows, {len(columns['hip'])} usable; wanted {ROWS_READ},"
+            f" {ROWS_KEPT}"
         )
     constant = ~np.isin(columns["variable"], list(VARIABLE_TYPES))
     stored = {}

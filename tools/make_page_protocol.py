@@ -14,7 +14,10 @@ from hilstar.server.console import protocol
 OUTPUT = (
     Path(__file__).resolve().parents[1] / "hilstar" / "server" / "console" / "page" / "protocol.js"
 )
-HEAD = "// What the page and its server share. Made from console/protocol.py by tools/make_page_protocol.py: edit it there.\n"
+HEAD = (
+    "// What the page and its server share. Made from console/protocol.py by"
+    " tools/make_page_protocol.py: edit it there.\n"
+)
 
 
 def page_protocol() -> str:

@@ -77,7 +77,8 @@ def main(source: Path, target: Path = PACKAGED_LIBRARY) -> None:
         source_sha256=np.array(digest),
     )
     print(
-        f"{target}: {len(library.flux)} spectra, {target.stat().st_size} bytes, rounding at most {worst:.1e}"
+        f"{target}: {len(library.flux)} spectra, {target.stat().st_size} bytes, rounding at most"
+        f" {worst:.1e}"
     )
 
 
@@ -103,9 +104,10 @@ def read_wheel(source: Path) -> tuple[Library, str]:
     mean = {band: band_mean(library, passband(band)) for band in ZERO_POINT_MAG}
     mag = {band: -2.5 * np.log10(mean[band]) - ZERO_POINT_MAG[band] for band in mean}
     flux = flux / mean["V"][:, None]
-    return replace(
-        library, flux=flux, bv_mag=mag["B"] - mag["V"], vi_mag=mag["V"] - mag["I"]
-    ), digest
+    return (
+        replace(library, flux=flux, bv_mag=mag["B"] - mag["V"], vi_mag=mag["V"] - mag["I"]),
+        digest,
+    )
 
 
 def read_spectrum(file: bytes) -> tuple[str, FloatArray, FloatArray]:

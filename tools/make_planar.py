@@ -76,12 +76,16 @@ def planar() -> Any:
 
 def main() -> None:
     """Trace it and write the file."""
-    made_by = "tools/make_planar.py: US patent 583336 (P. Rudolph, 1897), example 2, scaled, at F/6.3, traced by optiland"
+    made_by = (
+        "tools/make_planar.py: US patent 583336 (P. Rudolph, 1897), example 2, scaled, at F/6.3,"
+        " traced by optiland"
+    )
     found = traced(planar(), PLATE, SAMPLES, TOLERANCE, made_by)
     path = Path(__file__).parent.parent / "configs" / "planar-1897.fits"
     write_glass(path, replace(found.glass, transmission=FILTER))
     print(
-        f"f {found.focal_length_mm:.4f} mm, F/{found.f_number:.3f}, {len(found.glass.basis)} components"
+        f"f {found.focal_length_mm:.4f} mm, F/{found.f_number:.3f}, {len(found.glass.basis)}"
+        " components"
     )
 
 

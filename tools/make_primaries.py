@@ -46,7 +46,10 @@ def main() -> None:
 
     for name, (display, source) in MEASURED.items():
         one = colour.MSDS_DISPLAY_PRIMARIES[display]
-        words = f"{display}: primaries as measured, relative power per nm. {source}; colour-science 0.4.7 (PyPI, BSD-3-Clause)"
+        words = (
+            f"{display}: primaries as measured, relative power per nm. {source}; colour-science"
+            " 0.4.7 (PyPI, BSD-3-Clause)"
+        )
         written(
             name,
             words,

@@ -150,7 +150,8 @@ def take_session(page: Browser, path: Path) -> None:
         page.prefer(color_scheme=theme)
         page.get(path.as_uri())
         page.run(
-            "for (const name of ['machine', 'display', 'orientation']) document.getElementById(name).remove()"
+            "for (const name of ['machine', 'display', 'orientation'])"
+            " document.getElementById(name).remove()"
         )
         keep(page.get_screenshot_as_png(), f"first-light{ending}.png")
 

@@ -19,9 +19,13 @@ sys.path.insert(0, str(ROOT))
 
 from hilstar.basics.charts import write_csv  # noqa: E402
 from hilstar.instruments.study.stability import COLUMNS  # noqa: E402
-from tests.authority.failing_methods import CATALOGUE_AND_GEOMETRY, CURVES, DETECTOR_AND_ATTITUDE  # noqa: E402
+from tests.authority.failing_methods import (  # noqa: E402
+    CATALOGUE_AND_GEOMETRY,
+    CURVES,
+    DETECTOR_AND_ATTITUDE,
+)
 
-OUTPUT = ROOT / "hilstar" / "study" / "stability"
+OUTPUT = ROOT / "hilstar" / "instruments" / "study" / "stability"
 
 if __name__ == "__main__":
     for name, cases in (

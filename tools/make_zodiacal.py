@@ -32,7 +32,10 @@ def table_17(text: str) -> str:
         f"{dlon}," + ",".join("" if value >= BLANK else f"{value:g}" for value in row) + "\n"
         for dlon, row in zip(DLON_DEG, rows, strict=True)
     )
-    head = f"# Zodiacal light from 1 au at 500 nm, 1e-8 W m-2 sr-1 um-1; blank near the Sun: table 17, {SOURCE}\n"
+    head = (
+        "# Zodiacal light from 1 au at 500 nm, 1e-8 W m-2 sr-1 um-1; blank near the Sun: table 17,"
+        f" {SOURCE}\n"
+    )
     return f"{head}dlon_deg,{','.join(f'lat_{lat}_deg' for lat in LAT_DEG)}\n{body}"
 
 

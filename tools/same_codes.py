@@ -265,7 +265,8 @@ def drawn_by(program: str, name: str, folder: Path) -> dict[str, str]:
         )
         if done.returncode:
             sys.exit(
-                f"{program} {' '.join(words)} ({name}): exit {done.returncode}: {done.stderr.strip()}"
+                f"{program} {' '.join(words)} ({name}): exit {done.returncode}:"
+                f" {done.stderr.strip()}"
             )
     files = [
         *sorted((folder / "frames").glob("*.png")),
@@ -294,7 +295,8 @@ def main() -> None:
             )
             different += len(others)
             print(
-                f"{name}: {len(before)} files, {f'{len(others)} differ: ' + ', '.join(others) if others else 'the same'}"
+                f"{name}: {len(before)} files,"
+                f" {f'{len(others)} differ: ' + ', '.join(others) if others else 'the same'}"
             )
     sys.exit(1 if different else 0)
 

@@ -46,8 +46,8 @@ KNOWN_AGAIN_NS = NS_PER_S // 5  # how soon a step of this machine's clock of Uni
 SAME_CLOCK = UnixOffset(0, 0)
 UNDISCIPLINED = "clock-undisciplined"
 UNDISCIPLINED_LINE = (
-    '[attitude] clock = "unix", but nothing keeps this machine\'s clock: the kernel states an error of 16 s; start chronyd, '
-    'ntpd or phc2sys, or write clock = "estimated"'
+    '[attitude] clock = "unix", but nothing keeps this machine\'s clock: the kernel states an error'
+    ' of 16 s; start chronyd, ntpd or phc2sys, or write clock = "estimated"'
 )
 MIN_BACK_OFF_NS = NS_PER_S // 20
 MAX_BACK_OFF_NS = NS_PER_S
@@ -407,7 +407,10 @@ class Receiver:
             self._settle(self.jumps.take(arrival))
             slowness = self.jumps.slowness
             if slowness and not self.clock.synchronised and not self._unit.named:
-                detail = f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small steps"
+                detail = (
+                    f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small"
+                    " steps"
+                )
                 if slowness > 0:
                     detail += " (a slow clock, or a link too slow for all packets)"
                 self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
@@ -429,12 +432,16 @@ class Receiver:
             total_s = self.jumps.correction_ns / NS_PER_S
             self._notices.tell(
                 "jump",
-                f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream continues",
+                f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream"
+                " continues",
             )
 
     def _refuse(self, arrival: Arrival[wire.Event], refusal: wire.Refusal) -> None:
         if self.counts.refuse(refusal):
-            line = f"packet refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
+            line = (
+                f"packet refused ({refusal.reason}): {refusal.detail}; further ones are only"
+                " counted"
+            )
             self._notices.mention("refused", line)
         sample = arrival.event if isinstance(arrival.event, wire.AttitudeSample) else None
         self._watch(arrival.host_ns, arrival.raw, sample, refusal)

@@ -127,7 +127,8 @@ def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None])
         if place in taken:
             other = "" if taken[place] == path else f", the same file as {taken[place]}"
             raise InputError(
-                f"{path}{other}: is read or written by this command already; write another name for the output"
+                f"{path}{other}: is read or written by this command already; write another name for"
+                " the output"
             )
         taken[place] = path
 
@@ -473,7 +474,8 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
         if endings in (CSV, TOML):
             return
         raise InputError(
-            f"{option} -: {_article(endings)} is no text, so it does not go to stdout; write OUT{endings[0]}"
+            f"{option} -: {_article(endings)} is no text, so it does not go to stdout; write"
+            f" OUT{endings[0]}"
         )
     ending = path.suffix.lower()
     if endings is FITS and ending == ".gz":
@@ -505,7 +507,8 @@ def check_directory(option: str, path: Path | None) -> None:
     refuse_stdout(option, path)
     if path.suffix.lower() in KNOWN and not path.is_dir():
         raise InputError(
-            f"{option} {path}: several files are written, into a directory; write the name of one, such as {path.stem}"
+            f"{option} {path}: several files are written, into a directory; write the name of one,"
+            f" such as {path.stem}"
         )
     there = next((place for place in (path, *path.parents) if exists(place)), None)
     if there is not None and not there.is_dir():

@@ -47,7 +47,10 @@ def escaped(value: object) -> str:
 def banner_of(state: str, headline: str, words: object = "") -> str:
     """The verdict of a page; its state is ok, warn or bad."""
     more = f"<span>{escaped(words)}</span>" if words else ""
-    return f'<div class="health" data-state="{state}"><div><strong>{escaped(headline)}</strong>{more}</div></div>'
+    return (
+        '<div class="health"'
+        f' data-state="{state}"><div><strong>{escaped(headline)}</strong>{more}</div></div>'
+    )
 
 
 def measured(value: float, error: float | None, unit: str = "") -> str:
@@ -80,7 +83,10 @@ def _cell(value: object, digits: int) -> str:
 
 def picture_of(data: bytes, kind: str, alt: str) -> str:
     """A picture of a media type (image/KIND) within the page."""
-    return f'<figure><img alt="{escaped(alt)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}"></figure>'
+    return (
+        f'<figure><img alt="{escaped(alt)}"'
+        f' src="data:image/{kind};base64,{base64.b64encode(data).decode()}"></figure>'
+    )
 
 
 def drawing_of(figure: Any, alt: str) -> str:

@@ -110,7 +110,8 @@ def opened_fits(data: bytes, size_px: tuple[int, int] | None = None) -> Iterator
     data = unpacked(data)
     if not data.startswith(FITS_MAGIC):
         raise ImageSizeError(
-            "is not a FITS image: it does not begin as FITS does; unpack it first, if it is a compressed one"
+            "is not a FITS image: it does not begin as FITS does; unpack it first, if it is a"
+            " compressed one"
         )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # astropy's about a cut file or keywords of older standards

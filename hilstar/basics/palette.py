@@ -21,4 +21,6 @@ def declarations(theme: str) -> str:
 def palette_css() -> str:
     """The style sheet of a page with a switch: dark, unless its root says `data-theme="light"`."""
     dark, light = (declarations(theme) for theme in THEMES)
-    return f':root {{ color-scheme: dark; {dark} }}\n:root[data-theme="light"] {{ color-scheme: light; {light} }}\n'
+    dark_root = f":root {{ color-scheme: dark; {dark} }}"
+    light_root = f':root[data-theme="light"] {{ color-scheme: light; {light} }}'
+    return f"{dark_root}\n{light_root}\n"

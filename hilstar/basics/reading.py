@@ -234,7 +234,8 @@ def _decoded(path: Path, number: int, line: str, advice: str) -> str:
                 path, f"it is no text: line {number} has a byte 0x{byte:02x}", advice
             ) from None
         warn_once(
-            f"{path}: line {number} is not UTF-8, and is read as Windows-1252; save the file as UTF-8"
+            f"{path}: line {number} is not UTF-8, and is read as Windows-1252; save the file as"
+            " UTF-8"
         )
         return raw.decode("cp1252")
     return line

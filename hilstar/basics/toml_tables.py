@@ -71,7 +71,10 @@ def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
     choices = _choices(plain(field.type))
     if choices and not isinstance(value, list):
         wanted = " or ".join(map(_toml, choices))
-        return f"{_place(table)}{key} = {_toml(value)}; {did_you_mean(value, map(str, choices))}{wanted} is wanted"
+        return (
+            f"{_place(table)}{key} = {_toml(value)};"
+            f" {did_you_mean(value, map(str, choices))}{wanted} is wanted"
+        )
     wanted = (
         fault.removeprefix("Expected ")
         .replace("`", "")

@@ -84,8 +84,9 @@ MAGNITUDE = {"mag mags magnitude": "1", "mmag": "1e-3"}
 DIMENSIONS = (TIME, LENGTH, ANGLE, RATE, MOTION, SHARE, PIXELS, MAGNITUDE)
 # Other words of a line of units or of brackets. They are never converted.
 OTHER = (
-    "dn adu counts count e- electrons electron e-/s e-/dn dn/e- dn/s adu/s v w cd/m2 lx lux k degc mag/arcsec2 w/m2 w/m2/nm"
-    ' yr jyr year date jd mjd string str float int bool h:m:s d:m:s "h:m:s" "d:m:s"'
+    "dn adu counts count e- electrons electron e-/s e-/dn dn/e- dn/s adu/s v w cd/m2 lx lux k degc"
+    " mag/arcsec2 w/m2 w/m2/nm yr jyr year date jd mjd string str float int bool h:m:s d:m:s"
+    ' "h:m:s" "d:m:s"'
 )
 # What is not ASCII in a unit, in ASCII.
 ASCII_OF = {

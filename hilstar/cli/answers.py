@@ -159,7 +159,8 @@ def _shown_by_page() -> "FloatArray | None":
     except (OSError, http.client.HTTPException, *NOT_JSON, LookupError, TypeError):
         return None  # no run, one without an attitude, or another program
     say(
-        f"what is shown: RA {shown.ra_deg:.4f}, Dec {shown.dec_deg:.4f}, by the page at {HOST}:{PORT}"
+        f"what is shown: RA {shown.ra_deg:.4f}, Dec {shown.dec_deg:.4f}, by the page at"
+        f" {HOST}:{PORT}"
     )
     return np.array(shown.q)
 

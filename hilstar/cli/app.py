@@ -21,9 +21,15 @@ COMMANDS = {
     "Study": ("study", "benchmark"),
     "This machine": ("doctor",),
 }
-CALIBRATE = "Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
+CALIBRATE = (
+    "Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by"
+    " stars."
+)
 SENSOR = "A tracker's sensor for the bench file, from its EMVA 1288 data sheet or its own frames."
-OPTICS = "A tracker's glass for `[tracker.optics] psf`: point spread functions by place, colour and focus."
+OPTICS = (
+    "A tracker's glass for `[tracker.optics] psf`: point spread functions by place, colour and"
+    " focus."
+)
 SERVICE = "A run that this machine starts, watches, and starts again."
 # The same of files with several commands.
 GROUPS = {

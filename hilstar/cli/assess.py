@@ -23,16 +23,22 @@ def assess(
         Path | None,
         Argument(
             metavar="[TELEMETRY]",
-            help="Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar first), AEM, MCAP;"
-            " by default the answers in the ledger.",
+            help=(
+                "Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar"
+                " first), AEM, MCAP;"
+                " by default the answers in the ledger."
+            ),
             show_default=False,
         ),
     ] = None,
     stamp: Annotated[
         Literal["start", "middle", "end"] | None,
         Option(
-            help="Where in an exposure of tracker.exposure_s t_s stands; by default the middle, for the ledger's own answers"
-            " as its bench file says.",
+            help=(
+                "Where in an exposure of tracker.exposure_s t_s stands; by default the middle, for"
+                " the ledger's own answers"
+                " as its bench file says."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -62,7 +68,8 @@ def assess(
     check_directory("-o", output)
     if not abs(latency_ms) < MAX_LATENCY_MS:
         raise InputError(
-            f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g} either way"
+            f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g}"
+            " either way"
         )
     names = ("budget.html", "budget.csv", "slices.csv", "wrong.csv", "outages.csv")
     check_files(

@@ -33,7 +33,10 @@ def attitude(
         Option(
             "--at",
             metavar="T",
-            help="Seconds after the log's first sample, or a date and time as the log has them; by default its first sample.",
+            help=(
+                "Seconds after the log's first sample, or a date and time as the log has them; by"
+                " default its first sample."
+            ),
         ),
     ] = None,
     bench: Annotated[
@@ -106,7 +109,8 @@ def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
     with open_link(file.config, file.folder) as link:
         if link.steps:
             raise InputError(
-                f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar serve --explain"
+                f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar"
+                " serve --explain"
             )
         return _Found(first_attitude(link, patience_s), link.conventions)
 
@@ -162,7 +166,10 @@ def _lines(told: dict[str, Any]) -> list[str]:
     lines = [
         f"q_icrs_to_cam {q}, t_ns {told['t_ns']}"
         + (" (held: in a gap of the log)" if told["held"] else ""),
-        f"RA {turn_text(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll {turn_text(told['roll_deg'])} deg",
+        (
+            f"RA {turn_text(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll"
+            f" {turn_text(told['roll_deg'])} deg"
+        ),
     ]
     if told["rate_deg_s"] is not None:
         lines.append(
@@ -173,8 +180,12 @@ def _lines(told: dict[str, Any]) -> list[str]:
     if not told["stars"]:
         lines.append("no star of the catalogue is in view")
     for star in told["stars"]:
-        where = f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px, {star.from_boresight_deg:.2f} deg from the middle"
+        where = (
+            f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px,"
+            f" {star.from_boresight_deg:.2f} deg from the middle"
+        )
         lines.append(
-            f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}: {where}"
+            f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}:"
+            f" {where}"
         )
     return lines

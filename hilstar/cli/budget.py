@@ -23,8 +23,11 @@ def budget(
     centroider: Annotated[
         str | None,
         Option(
-            help="Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or box5 (centres of mass), or "
-            "all of them; what the bench has under verify, or fit, unless given."
+            help=(
+                "Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or"
+                " box5 (centres of mass), or "
+                "all of them; what the bench has under verify, or fit, unless given."
+            )
         ),
     ] = None,
     noise: Annotated[

@@ -234,8 +234,11 @@ def alignment(
         Path,
         Argument(
             metavar="PAIRS.csv",
-            help="Commanded and reported q_icrs_to_cam, scalar first: qw,qx,qy,qz,tw,tx,ty,tz[,valid]. With --ledger, the"
-            " tracker's telemetry: t_s,qw,qx,qy,qz[,valid].",
+            help=(
+                "Commanded and reported q_icrs_to_cam, scalar first:"
+                " qw,qx,qy,qz,tw,tx,ty,tz[,valid]. With --ledger, the"
+                " tracker's telemetry: t_s,qw,qx,qy,qz[,valid]."
+            ),
         ),
     ],
     output: Annotated[
@@ -245,8 +248,11 @@ def alignment(
         Path | None,
         Option(
             metavar="RUN.mcap",
-            help="The ledger of the run that the telemetry is of: t_s is the middle of an exposure in seconds of the ledger's"
-            " light_ns, the sender's clock.",
+            help=(
+                "The ledger of the run that the telemetry is of: t_s is the middle of an exposure"
+                " in seconds of the ledger's"
+                " light_ns, the sender's clock."
+            ),
         ),
     ] = None,
     offset_s: Annotated[
@@ -271,7 +277,8 @@ def alignment(
     check_ending("-o", output, TOML)
     if offset_s is not None and ledger is None:
         raise InputError(
-            "--offset-s: pairs have no times; give it with --ledger RUN.mcap and the tracker's telemetry"
+            "--offset-s: pairs have no times; give it with --ledger RUN.mcap and the tracker's"
+            " telemetry"
         )
     if offset_s is not None and not abs(offset_s) < MAX_OFFSET_S:
         raise InputError(
@@ -356,7 +363,8 @@ def plan(
         say(f"{shown} of {len(planned)} patches shown")
     elif headless is None:
         say(
-            "add --show for the patches on a display (space for the next one), or --headless DIR for pictures of them"
+            "add --show for the patches on a display (space for the next one), or --headless DIR"
+            " for pictures of them"
         )
 
 
@@ -416,13 +424,14 @@ def photometric(
     typer.echo(f"{'black level':20}{black:.3e} of white, contrast {contrast}")
     typer.echo(f"{'noise':20}{100 * found['noise_relative']:.2f} % of a reading")
     typer.echo(
-        f"{'held-out levels':20}{held['rms_percent']:.2f} / {held['p95_percent']:.2f} / {held['max_percent']:.2f} %"
-        f" (rms / 95 % / max), {held['max_mag']:.4f} mag maximum"
+        f"{'held-out levels':20}{held['rms_percent']:.2f} / {held['p95_percent']:.2f} /"
+        f" {held['max_percent']:.2f} % (rms / 95 % / max), {held['max_mag']:.4f} mag maximum"
     )
     for name, one in found["channels"].items() if len(found["channels"]) > 1 else ():
         rms, under = one["holdout"]["rms_percent"], one["black_level"]["relative"]
         typer.echo(
-            f"{'channel ' + name:20}{one['shape']}, held-out levels {rms:.2f} % rms, black {under:.3e} of its white"
+            f"{'channel ' + name:20}{one['shape']}, held-out levels {rms:.2f} % rms, black"
+            f" {under:.3e} of its white"
         )
     for decade, percent in (found["crosstalk_percent"] or {}).items():
         unsure = found["crosstalk_error_percent"][decade]
@@ -469,7 +478,8 @@ def scale(
         found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)
     if found.scatter_mag > UNSURE_MAG:
         say(
-            f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response"
+            f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation,"
+            " and the response"
         )
     if output is not None:
         with_flux_at_white(file, found, output)
@@ -481,7 +491,8 @@ def scale(
         "written": None if output is None else str(output),
     }
     lines = [
-        f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:"
+        f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag;"
+        " under [render]:"
     ]
     lines.append(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")
     if found.relative_error is not None:

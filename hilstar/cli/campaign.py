@@ -71,7 +71,10 @@ def campaign(
         str,
         Option(
             metavar="SOLVER",
-            help='What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that prints a quaternion.',
+            help=(
+                'What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image}'
+                " that prints a quaternion."
+            ),
         ),
     ] = CENTROIDS,
     solver_timeout: Annotated[
@@ -112,7 +115,8 @@ def campaign(
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
         raise InputError(
-            "campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory"
+            "campaign --scheduler: the cluster's workers are its own; leave out --workers and"
+            " --memory"
         )
     pooled = {
         "--workers": workers is not None,
@@ -234,7 +238,8 @@ def show_cases(
 
         if not this.show(directory, display, notices, on_done):
             say(
-                f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there"
+                f"hilstar: {count} of {this.cases} cases are done; the same command goes on from"
+                " there"
             )
             raise KeyboardInterrupt
 
@@ -268,7 +273,8 @@ def run_cases(
                     this.run(directory, pool, on_done)
         except KeyboardInterrupt:
             say(
-                f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there"
+                f"hilstar: {count} of {this.cases} cases are done; the same command goes on from"
+                " there"
             )
             raise
 
@@ -291,7 +297,8 @@ def telling(cases: int) -> Iterator[Callable[[int], None]]:
             last_s = now_s
             a_second = (done - first[0]) / (now_s - first[1])
             say(
-                f"hilstar: {done} of {cases} cases, {a_second:.3g} a second, {(cases - done) / a_second:.0f} s left"
+                f"hilstar: {done} of {cases} cases, {a_second:.3g} a second,"
+                f" {(cases - done) / a_second:.0f} s left"
             )
 
     yield line

@@ -46,7 +46,8 @@ def catalogue(
 
     if output != STDOUT and output.suffix.lower() not in ENDINGS:
         raise InputError(
-            f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for CSV on stdout"
+            f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for"
+            " CSV on stdout"
         )
     check_outputs([bench_file], [output])
     file = read_bench_file(bench_file)

@@ -42,7 +42,10 @@ def certify(
         str | None,
         Option(
             metavar="CMD",
-            help="Command that takes the tracker's image, as that of first-light ({output}, {pattern}).",
+            help=(
+                "Command that takes the tracker's image, as that of first-light ({output},"
+                " {pattern})."
+            ),
         ),
     ] = None,
     virtual: Annotated[
@@ -110,7 +113,9 @@ def certify(
     ):
         if given is not None and (virtual is not None) != (name == "--whole"):
             raise InputError(
-                f"{name}: {'is for --virtual' if name == '--whole' else 'a virtual bench has its own'}; leave it out"
+                f"{name}:"
+                f" {'is for --virtual' if name == '--whole' else 'a virtual bench has its own'};"
+                " leave it out"
             )
     if (check or warm_up) and grab is None and virtual is None:
         raise InputError("--check: reads the bench; write --grab CMD, or --virtual TRUTH.toml")
@@ -155,7 +160,8 @@ def _certify(
     if exists(path):
         if not again:
             raise InputError(
-                f"{path}: exists; write --again to certify anew in its place, --check to check it, or another -o"
+                f"{path}: exists; write --again to certify anew in its place, --check to check it,"
+                " or another -o"
             )
         replaces = read_certificate(path).number
     warmed = None
@@ -202,7 +208,8 @@ def _check(
         since = read_certificate(output / CERTIFICATE).number
     elif reference is None:
         say(
-            f"{output}: has no certificate; the check is against the bench file (hilstar certify {file.path.name} -o {output})"
+            f"{output}: has no certificate; the check is against the bench file (hilstar certify"
+            f" {file.path.name} -o {output})"
         )
     warmed = (
         watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up")
@@ -216,12 +223,12 @@ def _check(
     for each in figures:
         u = f"{each.value:+.4g} +- {(each.upper - each.lower) / 2:.2g} {each.unit}"
         lines.append(
-            f"{each.quantity:16}{u:28}{'in' if each.in_tolerance else 'OUT OF'} tolerance ({each.threshold:.2g})"
+            f"{each.quantity:16}{u:28}{'in' if each.in_tolerance else 'OUT OF'} tolerance"
+            f" ({each.threshold:.2g})"
         )
     lines += [f"{'since':16}{since}", *([] if warmed is None else [f"{'warm-up':16}{warmed.line}"])]
-    lines.append(
-        f"{'verdict':16}{'the bench is as certified' if good else 'the bench has moved: certify it --again'}"
-    )
+    verdict = "the bench is as certified" if good else "the bench has moved: certify it --again"
+    lines.append(f"{'verdict':16}{verdict}")
     found = {
         "certificate": since,
         "in_tolerance": good,

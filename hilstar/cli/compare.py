@@ -57,7 +57,10 @@ def compare(
     else:
         if comparison.common is not None:
             typer.echo(f"{'in common':20}{comparison.common.line()}")
-        rest = f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little light of their own in view"
+        rest = (
+            f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little"
+            " light of their own in view"
+        )
         typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
         each = {"": summary} | {f", {name}": one for name, one in summary["channels"].items()}
         for (name, unit), (channel, figures) in product(

@@ -112,16 +112,20 @@ def demo(
         tracker.report(result.summary.answers, as_json)
         missed = result.summary.missed_frames
         if missed > MAX_MISSED * result.summary.frames:
-            line = f"the display missed {missed} frames, and answers that looked while it held a frame are in no figure"
+            line = (
+                f"the display missed {missed} frames, and answers that looked while it held a frame"
+                " are in no figure"
+            )
             say(f"hilstar: {line}; the machine is busy: close other programs, and run it again")
     if not as_json:
         typer.echo(
-            f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)"
+            f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png"
+            " (stretched)"
         )
     if result.summary.stale_frames and caught() is None:
         line = (
-            f"{result.summary.stale_frames} of {result.summary.frames} frames show an old sky: no attitude came in time; "
-            "the machine is busy, so close other programs and run it again"
+            f"{result.summary.stale_frames} of {result.summary.frames} frames show an old sky: no"
+            " attitude came in time; the machine is busy, so close other programs and run it again"
         )
         if as_json:
             say(f"hilstar: {line}")
@@ -290,6 +294,5 @@ class TrackerBeside:
         typer.echo(f"{'page':24}{self._page}")
         typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
         for name, planted_value, value, unit in rows:
-            typer.echo(
-                f"{name:28}{planted_value:10.2f}{'unknown' if value is None else f'{value:.2f}':>10} {unit}"
-            )
+            figure = "unknown" if value is None else f"{value:.2f}"
+            typer.echo(f"{name:28}{planted_value:10.2f}{figure:>10} {unit}")

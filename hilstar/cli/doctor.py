@@ -24,7 +24,10 @@ Report = Annotated[
     bool,
     Option(
         "--report",
-        help="Print this machine as a row of the table of docs/where-it-fails.md, without names or serial numbers.",
+        help=(
+            "Print this machine as a row of the table of docs/where-it-fails.md, without names or"
+            " serial numbers."
+        ),
     ),
 ]
 

@@ -176,7 +176,10 @@ def _spaced_numbers(words: list[str]) -> str | None:
         parts = list(takewhile(NUMBERS.fullmatch, rest)) if option in NUMBER_OPTIONS else []
         if len(parts) > 1:
             numbers = ",".join(",".join(parts).replace(",", " ").split())
-            return f"{option} {' '.join(parts)}: write {option} {numbers}, with commas and without spaces"
+            return (
+                f"{option} {' '.join(parts)}: write {option} {numbers}, with commas and without"
+                " spaces"
+            )
     return None
 
 

@@ -42,23 +42,32 @@ def first_light(
         str | None,
         Option(
             metavar="CMD",
-            help="Command that takes the tracker's image: {output} is the file to write; {pattern}, where the command shows"
-            " the pattern itself, a picture of it; {exposure_s}, where it can be set, the exposure.",
+            help=(
+                "Command that takes the tracker's image: {output} is the file to write; {pattern},"
+                " where the command shows"
+                " the pattern itself, a picture of it; {exposure_s}, where it can be set, the"
+                " exposure."
+            ),
         ),
     ] = None,
     virtual: Annotated[
         Path | None,
         Option(
             metavar="TRUTH.toml",
-            help="Without hardware: a bench file that says how the bench really is. truth-example.toml comes with hilstar"
-            " (in configs), for the bench of configs/demo.toml.",
+            help=(
+                "Without hardware: a bench file that says how the bench really is."
+                " truth-example.toml comes with hilstar"
+                " (in configs), for the bench of configs/demo.toml."
+            ),
         ),
     ] = None,
     dark: Annotated[
         Path | None,
         Option(
             metavar="FILE",
-            help="The tracker's image with the monitor switched off, for the monitor's black level.",
+            help=(
+                "The tracker's image with the monitor switched off, for the monitor's black level."
+            ),
         ),
     ] = None,
     diode: Annotated[
@@ -80,7 +89,10 @@ def first_light(
         float | None,
         Option(
             metavar="MINUTES",
-            help="At most so long is white watched until it is stable to 0.2 %, 0 for not at all. [with --virtual 30, else 0]",
+            help=(
+                "At most so long is white watched until it is stable to 0.2 %, 0 for not at all."
+                " [with --virtual 30, else 0]"
+            ),
             min=0,
             max=1440,
         ),
@@ -89,7 +101,10 @@ def first_light(
         int | None,
         Option(
             metavar="N",
-            help="Images of each field of stars that verify averages. [as many as their noise asks for, 25 at most; by hand 1]",
+            help=(
+                "Images of each field of stars that verify averages. [as many as their noise asks"
+                " for, 25 at most; by hand 1]"
+            ),
             min=1,
             max=1000,
         ),
@@ -136,7 +151,8 @@ def first_light(
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     if by_hand and warm_up:
         raise InputError(
-            "--warm-up: a person cannot save an image every ten seconds; give --grab CMD, or leave it out"
+            "--warm-up: a person cannot save an image every ten seconds; give --grab CMD, or leave"
+            " it out"
         )
     watched_s = SECONDS * (
         (0.0 if virtual is None else WARM_UP_MIN) if warm_up is None else warm_up

@@ -46,12 +46,14 @@ def _address(path: Path, settings: object) -> str:
     assert isinstance(settings, AttitudeSettings)
     if settings.source != "udp":
         raise InputError(
-            f'{path}: [attitude] source = "{settings.source}"; an FMU sends over UDP: write source = "udp"'
+            f'{path}: [attitude] source = "{settings.source}"; an FMU sends over UDP: write source'
+            ' = "udp"'
         )
     place, _ = udp_road(settings)
     if not place.port:
         raise InputError(
-            f"{path}: [attitude] port 0 is another one at each start; write the port to which the FMU sends"
+            f"{path}: [attitude] port 0 is another one at each start; write the port to which the"
+            " FMU sends"
         )
     if not settings.status_hz:
         raise InputError(

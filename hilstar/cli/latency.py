@@ -56,7 +56,8 @@ def latency(
     )
     if (edges is None) == (diode is None):
         raise InputError(
-            "latency: give the edges with either --edges EDGES.csv or --diode serial:/dev/ttyX@115200"
+            "latency: give the edges with either --edges EDGES.csv or --diode"
+            " serial:/dev/ttyX@115200"
         )
     if diode is None:
         found = by_diode.read_edges(edges or Path())

@@ -159,7 +159,8 @@ def lens(
         pitch_um, size = pitch_um or tracker.pixel_pitch_um, size or tracker.resolution_px
     if pitch_um is None or size is None:
         raise InputError(
-            "a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and --resolution W,H"
+            "a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and"
+            " --resolution W,H"
         )
     focuses = parse_numbers(
         focuses_um,
@@ -176,7 +177,8 @@ def lens(
     _tell(output, found.glass, as_json, {**facts, "notes": list(found.notes)})
     if not as_json:
         typer.echo(
-            f"in the bench file, under [tracker]: focal_length_mm = {found.focal_length_mm:.6g}  # F/{found.f_number:.3g}"
+            f"in the bench file, under [tracker]: focal_length_mm = {found.focal_length_mm:.6g}  #"
+            f" F/{found.f_number:.3g}"
         )
 
 
@@ -199,6 +201,9 @@ def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, Any] | No
         "written": [str(output)],
     }
     colours = f"{len(glass.wavelengths_nm)} wavelengths" if known else "one PSF for all light"
-    line = f"{len(glass.places_px)} field points, {colours}, {len(glass.focuses_um)} focus positions: {len(glass.basis)}"
+    line = (
+        f"{len(glass.places_px)} field points, {colours}, {len(glass.focuses_um)} focus positions:"
+        f" {len(glass.basis)}"
+    )
     off = f"components, which put up to {glass.residual:.1e} of a PSF's light elsewhere"
     print_found(as_json, facts, [f"{line} {off}; wrote {output}"])

@@ -95,7 +95,10 @@ ConventionText = Annotated[
     str | None, unsaid("--convention", metavar=CONVENTION_METAVAR, help=CONVENTION_HELP)
 ]
 MAX_SEED = 2**63 - 1  # largest number in a FITS header
-LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS or CIC AEM, STK .a, MCAP (a ledger), a SPICE CK or a ROS bag."
+LOG_HELP = (
+    "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS or CIC AEM, STK .a, MCAP (a ledger), a SPICE CK or a"
+    " ROS bag."
+)
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MAX_SPIN_RAD_S = 1e6
 SPIN_FORM = (
@@ -104,7 +107,10 @@ SPIN_FORM = (
 SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
 SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at minimum"
 SPLIT_UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
-READING_FORM = "write --reading HIP,DN or HIP,DN,SIGMA: a star's Hipparcos number, the sum of its DN over the background, and its noise"
+READING_FORM = (
+    "write --reading HIP,DN or HIP,DN,SIGMA: a star's Hipparcos number, the sum of its DN over the"
+    " background, and its noise"
+)
 MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
 MAX_SIZE_PX = 32768
 MAX_AT_S = 1e10
@@ -182,8 +188,8 @@ def parse_at(
         raise InputError(f"{command} --at {at_s:g}: write seconds, 1e10 at most")
     if not timed and not has_observer(config):
         raise InputError(
-            f"{command} --at {at_s:g}: nothing moves in this sky; write [sky.bodies] or [spacecraft], give a --scenario, or"
-            " leave it out"
+            f"{command} --at {at_s:g}: nothing moves in this sky; write [sky.bodies] or"
+            " [spacecraft], give a --scenario, or leave it out"
         )
     return round(at_s * NS_PER_S)
 
@@ -250,7 +256,8 @@ def parse_mounting(text: str) -> "Mounting":
     w, x, y, z = parse_numbers(text, 4, "--mounting", "W,X,Y,Z")
     if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
         raise InputError(
-            f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z"
+            f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion"
+            " W,X,Y,Z"
         )
     return Mounting((w, x, y, z), by_option=True)
 
@@ -273,7 +280,8 @@ def parse_convention(text: str) -> dict[str, str]:
             )
         if value not in choices[key]:
             raise InputError(
-                f"--convention {text}: {key} is {' or '.join(choices[key])}; write {CONVENTION_METAVAR}"
+                f"--convention {text}: {key} is {' or '.join(choices[key])}; write"
+                f" {CONVENTION_METAVAR}"
             )
         named[key] = value
     return named
@@ -314,8 +322,8 @@ class LogStatements:
             named = parse_convention(self.convention)
             if self.mounting is not None and named.get("frame") == "cam":
                 raise InputError(
-                    f"--mounting {self.mounting}: --convention {self.convention} says that the attitudes are the camera's;"
-                    " write frame=body, or leave out --mounting"
+                    f"--mounting {self.mounting}: --convention {self.convention} says that the"
+                    " attitudes are the camera's; write frame=body, or leave out --mounting"
                 )
             stated = replace(stated, convention=Convention(**named), convention_by="--convention")  # type: ignore[arg-type]
         return stated
@@ -439,7 +447,8 @@ def parse_counts(text: str, most: int) -> tuple[int, ...]:
     parts = text.split(",")
     if not all(re.fullmatch(r"[1-9]\d{0,8}", part) and int(part) <= most for part in parts):
         raise InputError(
-            f"--stars {text}: write whole numbers from 1 to {most} with commas between them, such as 100,1000"
+            f"--stars {text}: write whole numbers from 1 to {most} with commas between them, such"
+            " as 100,1000"
         )
     return tuple(dict.fromkeys(map(int, parts)))
 
@@ -449,6 +458,7 @@ def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
     found = [re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", part) for part in text.split(",")]
     if not all(match and max(int(match[1]), int(match[2])) <= MAX_SIZE_PX for match in found):
         raise InputError(
-            f"--sizes {text}: write WIDTHxHEIGHT, up to {MAX_SIZE_PX} px, with commas between them, such as 640x480,1920x1080"
+            f"--sizes {text}: write WIDTHxHEIGHT, up to {MAX_SIZE_PX} px, with commas between them,"
+            " such as 640x480,1920x1080"
         )
     return tuple(dict.fromkeys((int(match[1]), int(match[2])) for match in found if match))

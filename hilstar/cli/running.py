@@ -43,7 +43,10 @@ Strict = Annotated[
     bool,
     Option(
         "--strict",
-        help="Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was shown for any time.",
+        help=(
+            "Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was"
+            " shown for any time."
+        ),
     ),
 ]
 Windowed = Annotated[
@@ -53,8 +56,10 @@ Force = Annotated[
     bool,
     Option(
         "--force",
-        help="Show on a display that the start-up checks refuse, or on a monitor that the bench's files were not measured on;"
-        " status, page and ledger go on saying so.",
+        help=(
+            "Show on a display that the start-up checks refuse, or on a monitor that the bench's"
+            " files were not measured on; status, page and ledger go on saying so."
+        ),
     ),
 ]
 LedgerFile = Annotated[
@@ -79,7 +84,9 @@ Console = Annotated[
     Option(
         "--console",
         metavar="[HOST:PORT]",
-        help="Serve the operator's page there, by default on 127.0.0.1:8765; port 0 is any free one.",
+        help=(
+            "Serve the operator's page there, by default on 127.0.0.1:8765; port 0 is any free one."
+        ),
         show_default=False,
     ),
 ]
@@ -88,7 +95,10 @@ Scpi = Annotated[
     Option(
         "--scpi",
         metavar="[HOST:PORT]",
-        help="Answer a test stand's SCPI there, by default on 127.0.0.1:5025; port 0 is any free one.",
+        help=(
+            "Answer a test stand's SCPI there, by default on 127.0.0.1:5025; port 0 is any free"
+            " one."
+        ),
         show_default=False,
     ),
 ]
@@ -99,7 +109,10 @@ Token = Annotated[
         "--token",
         metavar="TEXT",
         envvar="HILSTAR_TOKEN",
-        help="What a browser must give to see the page; beyond 127.0.0.1 one is made where none is given.",
+        help=(
+            "What a browser must give to see the page; beyond 127.0.0.1 one is made where none is"
+            " given."
+        ),
     ),
 ]
 ConsoleName = Annotated[
@@ -110,7 +123,10 @@ ConsoleName = Annotated[
         help="A further name of the page, as a proxy shows it; may be given often.",
     ),
 ]
-FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar tracker)"
+FRAMES_HELP = (
+    "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar"
+    " tracker)"
+)
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
@@ -349,7 +365,8 @@ def run_with_faults(
     if recording is not None and recording.faults:
         if scenario is not None:
             raise InputError(
-                f"--scenario {scenario.path}: the run that is replayed has faults of its own; leave it out"
+                f"--scenario {scenario.path}: the run that is replayed has faults of its own; leave"
+                " it out"
             )
         yield ReplayedFaults(bench, recording, ledger)
         return
@@ -430,7 +447,8 @@ def scpi_listener(
     if scpi is None:
         if file.config.attitude.source == "scpi":
             raise InputError(
-                f'{file.path}: [attitude] source = "scpi" needs SCPI; add --scpi, or name another source'
+                f'{file.path}: [attitude] source = "scpi" needs SCPI; add --scpi, or name another'
+                " source"
             )
         yield None
         return

@@ -84,7 +84,8 @@ def send(
     lost, corrupted, reordered = (options.parse_share(text, option) for option, text in named)
     if lost + corrupted + reordered > 1:
         raise InputError(
-            "send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions"
+            "send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller"
+            " fractions"
         )
     samples, total = wanted_samples(log, spin, rate, radec, statements)
     if duration is not None:
@@ -135,9 +136,14 @@ def wanted_samples(
         raise InputError(f"--rate {rate:g}: write packets per second, 0.001 to 10000")
     if spin is not None:
         statements.refuse("it is for a LOG, and --spin sends none; leave it out")
-        return spin_samples(
-            options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")
-        ), math.inf
+        return (
+            spin_samples(
+                options.parse_spin(spin),
+                rate or 100.0,
+                options.parse_radec(radec or "84.057,-1.2,0"),
+            ),
+            math.inf,
+        )
     read = open_log(log or Path(), statements.stated())
     recorded = read.samples
     for _, line in [*read.told, *read.joins().told]:

@@ -169,7 +169,8 @@ def serve(
 
         if scpi is not None:
             raise InputError(
-                f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench file of a head"
+                f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench"
+                " file of a head"
             )
         valued = {"--frames": count, "--ledger-split": ledger_split, "--scenario": scenario}
         switches = {
@@ -283,7 +284,8 @@ def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str 
         raise InputError(f"--frames {counts[0]}: {form}")
     if endpoints and heads:
         raise InputError(
-            f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or leave it out"
+            f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or"
+            " leave it out"
         )
     return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
 

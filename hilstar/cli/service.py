@@ -49,8 +49,9 @@ TimeoutStartSec=120
 WatchdogSec=3
 KillMode=mixed
 TimeoutStopSec=10
-# What a run does not need is taken from it. Left are the network (attitudes, page), real-time priority, devices (GPU, serial
-# ports), /tmp (the X server's socket), memory that a compiler writes and runs (OpenGL), and files of yours.
+# What a run does not need is taken from it. Left are the network (attitudes, page), real-time
+# priority, devices (GPU, serial ports), /tmp (the X server's socket), memory that a compiler writes
+# and runs (OpenGL), and files of yours.
 {confined}NoNewPrivileges=yes
 SystemCallFilter={calls}
 SystemCallErrorNumber=EPERM
@@ -108,7 +109,8 @@ def install(
     text = unit_text(path, bench_file.resolve(), words, confined)
     if not confined:
         say(
-            "this system gives users no namespace of their own: the unit keeps the capabilities that systemd gives it"
+            "this system gives users no namespace of their own: the unit keeps the capabilities"
+            " that systemd gives it"
         )
     if to_stdout:
         typer.echo(text, nl=False)
@@ -130,11 +132,13 @@ def install(
         raise cannot_write(path, error) from error
     typer.echo(str(path))
     say(
-        f"start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user enable --now {service}"
+        "start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user"
+        f" enable --now {service}"
     )
     say(f"at boot as well, with nobody logged in: loginctl enable-linger {getpass.getuser()}")
     say(
-        f"to be rid of it: hilstar service uninstall {service.removeprefix('hilstar-').removesuffix('.service')}"
+        "to be rid of it: hilstar service uninstall"
+        f" {service.removeprefix('hilstar-').removesuffix('.service')}"
     )
 
 
@@ -166,7 +170,8 @@ def uninstall(
     typer.echo(str(path))
     if not stopped:
         say(
-            f"no systemd of this user was reached: if it still runs, systemctl --user stop {path.name}"
+            "no systemd of this user was reached: if it still runs, systemctl --user stop"
+            f" {path.name}"
         )
 
 
@@ -197,11 +202,13 @@ def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAd
         raise InputError(f"the options after --: {message()} (see hilstar serve --help)") from error
     if given["token"] is not None and "HILSTAR_TOKEN" not in os.environ:
         raise InputError(
-            "--token: a unit is no place for it; write HILSTAR_TOKEN=... into the .env file beside the unit"
+            "--token: a unit is no place for it; write HILSTAR_TOKEN=... into the .env file beside"
+            " the unit"
         )
     if given["ledger"] is not None and UTC_MARK not in str(given["ledger"]):
         raise InputError(
-            f"--ledger {given['ledger']}: each start needs a ledger of its own; write run-{UTC_MARK}.mcap"
+            f"--ledger {given['ledger']}: each start needs a ledger of its own; write"
+            f" run-{UTC_MARK}.mcap"
         )
     return words, None if given["console"] is None else parse_address(given["console"])
 

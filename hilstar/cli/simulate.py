@@ -66,7 +66,8 @@ def simulate(
     if log is not None:
         if output is None or radec or quaternion or rate or png or dn_png or at is not None:
             raise InputError(
-                "simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png or --dn-png"
+                "simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png"
+                " or --dn-png"
             )
         check_directory("-o", output)
         simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario, statements)
@@ -116,7 +117,10 @@ def simulate(
             "gl_renderer": simulator.renderer.gl_renderer,
         }
     dn, named = summary["dn"], f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
-    line = f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}"
+    line = (
+        f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote"
+        f" {', '.join(summary['written'])}"
+    )
     print_found(as_json, summary, [line])
     say_units_of(file)  # after the refusals: a failing command prints one line
 

@@ -178,7 +178,8 @@ def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str]
     if what == "stability":
         cases = study_of.run(output)
         lines = [
-            f"{'right' if c.right else 'WRONG'}  {c.case}: {c.happens} ({c.why}); not {c.method}: {c.fails}"
+            f"{'right' if c.right else 'WRONG'}  {c.case}: {c.happens} ({c.why}); not {c.method}:"
+            f" {c.fails}"
             for c in cases
         ]
         return lines, all(case.right for case in cases)

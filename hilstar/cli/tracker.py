@@ -53,8 +53,12 @@ def tracker(
         str | None,
         Option(
             metavar="truth|tetra3|CMD",
-            help="Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve], the default where it is"
-            ' installed), a command such as "solve {image}", python:MODULE:FUNCTION, or the true one each time.',
+            help=(
+                "Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve],"
+                " the default where it is"
+                ' installed), a command such as "solve {image}", python:MODULE:FUNCTION, or the'
+                " true one each time."
+            ),
         ),
     ] = None,
     form: Annotated[
@@ -153,7 +157,8 @@ def tracker(
     ):
         live.lost_in_space = solver_of(solver, live)
         say(
-            f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form}, to {link.endpoint}"
+            f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form},"
+            f" to {link.endpoint}"
         )
         process = TrackerProcess(live, frames, errors, rate_hz, chance)
 
@@ -191,20 +196,21 @@ def tell(told: dict[str, Any], as_json: bool) -> None:
     cpu, latency = told["cpu_ms"], told["latency_ms"]
     modes = ", ".join(f"{count} {mode}" for mode, count in told["modes"].items()) or "none"
     typer.echo(
-        f"{'answers':20}{told['answers']}, {told['valid']} valid ({modes}), {told['passed_over']} exposures passed over"
+        f"{'answers':20}{told['answers']}, {told['valid']} valid ({modes}), {told['passed_over']}"
+        " exposures passed over"
     )
     typer.echo(
         f"{'frames':20}{told['frames']['received']} received, {told['frames']['missing']} missing"
     )
     if cpu.p50 is not None:
         typer.echo(
-            f"{'an answer':20}{cpu.p50:.0f} ms of one core, {latency.p50:.0f} ms after mid-exposure (median)"
+            f"{'an answer':20}{cpu.p50:.0f} ms of one core, {latency.p50:.0f} ms after mid-exposure"
+            " (median)"
         )
     if told["own_bias_arcsec"] is not None:
         for name in ("bias", "sigma"):
-            typer.echo(
-                f"{'own ' + name:20}{', '.join(f'{value:.2f}' for value in told[f'own_{name}_arcsec'])} arcsec about x, y, z"
-            )
+            figures = ", ".join(f"{value:.2f}" for value in told[f"own_{name}_arcsec"])
+            typer.echo(f"{'own ' + name:20}{figures} arcsec about x, y, z")
 
 
 def parse_silent(text: str | None) -> tuple[float, float]:
@@ -216,7 +222,8 @@ def parse_silent(text: str | None) -> tuple[float, float]:
     match = SILENT.fullmatch(text)
     if match is None:
         raise InputError(
-            f"--silent {text}: write seconds, and when they begin where that is not 5 s, such as 5s or 5s@20s"
+            f"--silent {text}: write seconds, and when they begin where that is not 5 s, such as 5s"
+            " or 5s@20s"
         )
     return float(match[1]), SILENT_AFTER_S if match[2] is None else float(match[2])
 
@@ -232,7 +239,8 @@ def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
         return min(USUAL_RATE_HZ, fastest_hz)
     if not 0.01 <= rate_hz <= fastest_hz * (1 + 1e-9):
         raise InputError(
-            f"--rate {rate_hz:g}: write 0.01 to {fastest_hz:g} Hz; an exposure takes {exposure_s:g} s ([tracker] exposure_s)"
+            f"--rate {rate_hz:g}: write 0.01 to {fastest_hz:g} Hz; an exposure takes {exposure_s:g}"
+            " s ([tracker] exposure_s)"
         )
     return rate_hz
 
@@ -250,7 +258,8 @@ def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
 
         if find_spec("tetra3rs") is None:
             say(
-                "the extra hilstar[solve] is not installed: stars are identified by the true attitude, as by --solver truth"
+                "the extra hilstar[solve] is not installed: stars are identified by the true"
+                " attitude, as by --solver truth"
             )
             return None
     if text in {None, "tetra3"}:
@@ -274,7 +283,8 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
 
     if text == CENTROIDS:
         raise InputError(
-            "--solver centroids: is a campaign's; write truth, which identifies its stars by the true attitude"
+            "--solver centroids: is a campaign's; write truth, which identifies its stars by the"
+            " true attitude"
         )
     solver = choose_solver(text, Centroiding(), live.file.folder, SOLVER_S)
     nowhere, told = View(np.array([1.0, 0.0, 0.0, 0.0])), set[str]()

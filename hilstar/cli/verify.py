@@ -65,7 +65,8 @@ def verify(
         }
         for option in [name for name, value in given.items() if value]:
             raise InputError(
-                f"verify {option}: is of one bench; leave it out, or give one of the heads' files of {bench_file}"
+                f"verify {option}: is of one bench; leave it out, or give one of the heads' files"
+                f" of {bench_file}"
             )
         _verify_heads(file, fields, seed, as_json)
         return
@@ -105,8 +106,9 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
         told = "too few stars in both"
         if linear is not None and codes is not None:
             told = (
-                f"{linear['rms']:.4f} / {linear['max']:.4f} arcsec from linear light, {codes['rms']:.4f} / {codes['max']:.4f}"
-                f" from codes (rms / max, {pair['fields']} fields)"
+                f"{linear['rms']:.4f} / {linear['max']:.4f} arcsec from linear light,"
+                f" {codes['rms']:.4f} / {codes['max']:.4f} from codes (rms / max, {pair['fields']}"
+                " fields)"
             )
         lines.append(f"{f'{first} to {second}':20}{told}")
     print_found(as_json, {"angles": pairs}, lines)

@@ -144,7 +144,8 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     head = file.calibration
     if head.bits != bits:
         raise InputError(
-            f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at {bits} bits"
+            f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at"
+            f" {bits} bits"
         )
     columns = read_response(beside(path, head.response, "[calibration] response"), bits, read)
     uniformity = None
@@ -275,7 +276,8 @@ def _response(
         weights = weights[0] / sum(weights), weights[1] / sum(weights), weights[2] / sum(weights)
     elif bit_stealing:
         raise InputError(
-            f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b"
+            f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r,"
+            " g, b"
         )
     black = float(np.mean([light[0] for light in columns.values()])) / sum(whites.values())
     tables = {
@@ -420,7 +422,8 @@ def _numbers(table: TextTable, columns: Sequence[Chosen]) -> FloatArray:
         row = finite_numbers(table.path, line, names, texts, "write numbers that are not negative")
         if not 0 <= min(row) <= max(row) < 1e30:
             raise InputError(
-                f"{table.path}:{line}: {','.join(texts)[:40]!r}; write finite numbers that are not negative"
+                f"{table.path}:{line}: {','.join(texts)[:40]!r}; write finite numbers that are not"
+                " negative"
             )
         rows.append(row)
     if not rows:
@@ -449,7 +452,8 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
         )
     if len(code) < 2 or code[0] != 0 or code[-1] != white:
         raise InputError(
-            f"{path}: its codes are {code[0]:g} to {code[-1]:g}; write 0 (black) to {white} (white of {bits} bits)"
+            f"{path}: its codes are {code[0]:g} to {code[-1]:g}; write 0 (black) to {white} (white"
+            f" of {bits} bits)"
         )
     columns = {
         name: _every_code(path, name, code, rows[:, place + 1], white)
@@ -458,7 +462,8 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
     blacks = rows[0, 1:]
     if np.ptp(blacks) > BLACKS_AGREE * blacks.mean():
         raise InputError(
-            f"{path}: code 0 has {', '.join(f'{b:g}' for b in blacks)}; all show one black screen, so write one light"
+            f"{path}: code 0 has {', '.join(f'{b:g}' for b in blacks)}; all show one black screen,"
+            " so write one light"
         )
     return columns
 
@@ -473,7 +478,8 @@ def _every_code(
     if len(fall):
         low, high = code[fall[0]], code[fall[0] + 1]
         raise InputError(
-            f"{path}: light of channel {name} does not rise from code {low:g} to code {high:g}; every code must be brighter"
+            f"{path}: light of channel {name} does not rise from code {low:g} to code {high:g};"
+            " every code must be brighter"
         )
     if len(code) == white + 1:
         return light

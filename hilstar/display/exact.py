@@ -92,7 +92,10 @@ class ExactQuantiser(quantise.Quantiser):
     beginning of a sequence.
     """
 
-    words = "all codes of a star are chosen together, so that its flux and centroid are right in a single frame."
+    words = (
+        "all codes of a star are chosen together, so that its flux and centroid are right in a"
+        " single frame."
+    )
     shader = "exact.comp"
     other_codes = 5e-3
     weights: ClassVar[Weights] = IN_A_FRAME

@@ -226,9 +226,9 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         q_cam_to_mon=(w, x, y, z),
         tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
         **coefficients,
-        max_field_deg=math.degrees(math.atan(lens.max_tangent))
-        if math.isfinite(lens.max_tangent)
-        else None,
+        max_field_deg=(
+            math.degrees(math.atan(lens.max_tangent)) if math.isfinite(lens.max_tangent) else None
+        ),
         field=field,
         sigma=notes.sigma,
         error=notes.error,

@@ -82,7 +82,10 @@ class MonitorIdentity(Table, frozen=True):
             or "a monitor that does not say what it is"
         )
         own += f", serial {self.serial}" if self.serial else ""
-        return f"{own}, on {self.connector or 'a connector not known'} at {self.mode or 'a mode not known'}"
+        return (
+            f"{own}, on {self.connector or 'a connector not known'} at"
+            f" {self.mode or 'a mode not known'}"
+        )
 
     @property
     def doubt(self) -> str:
@@ -90,7 +93,10 @@ class MonitorIdentity(Table, frozen=True):
         if self.serial:
             return ""
         if self.maker:
-            return f"{self.maker} {self.model} has no serial number: another one of its kind on {self.connector} passes for it"
+            return (
+                f"{self.maker} {self.model} has no serial number: another one of its kind on"
+                f" {self.connector} passes for it"
+            )
         why = "EDID unreadable" if self.edid_sha256 else "no EDID"
         return f"{why}: the monitor is told apart by connector and mode alone"
 
@@ -213,7 +219,10 @@ def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
     ):
         before, after = getattr(was, key), getattr(now, key)
         if before not in ("", None) and after not in ("", None) and before != after:
-            yield f"{key.replace('_', ' ')} {str(before)[:SHOWN_DIGITS]}, now {str(after)[:SHOWN_DIGITS]}"
+            yield (
+                f"{key.replace('_', ' ')} {str(before)[:SHOWN_DIGITS]}, now"
+                f" {str(after)[:SHOWN_DIGITS]}"
+            )
     if was.window_system != now.window_system:
         before, after = (", ".join(one.window_system) or "nothing" for one in (was, now))
         yield f"the window system added {before}, and adds {after} now"

@@ -115,7 +115,8 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
     lit = np.flatnonzero(power > DARK_SHARE * power.max())
     if len(lit) < 3:
         raise InputError(
-            f"{path}: {len(lit)} samples with light, where three primaries are wanted; {CCSS_ADVICE}"
+            f"{path}: {len(lit)} samples with light, where three primaries are wanted;"
+            f" {CCSS_ADVICE}"
         )
     shape = samples[lit] / np.linalg.norm(samples[lit], axis=1, keepdims=True)
     together = shape @ shape.T
@@ -135,8 +136,9 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
     worst = min(found, default=(1.0, 0.0, []))[0]
     if worst > MIXED_WITHIN:
         raise InputError(
-            f"{path}: no three of its {len(lit)} samples are primaries of which the others are mixtures (the nearest leave"
-            f" {100 * worst:.0f} % of one): a white subpixel, or samples of several displays; {CCSS_ADVICE}"
+            f"{path}: no three of its {len(lit)} samples are primaries of which the others are"
+            f" mixtures (the nearest leave {100 * worst:.0f} % of one): a white subpixel, or"
+            f" samples of several displays; {CCSS_ADVICE}"
         )
     _, _, three = min(
         (one for one in found if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1]
@@ -149,8 +151,8 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
     )
     if drive.max() > 1 + MAX_EXCESS:
         raise InputError(
-            f"{path}: a sample has {drive.max():.2f} times the light of its primaries: a white subpixel, as of a panel that is"
-            f" no sum of red, green and blue; {CCSS_ADVICE}"
+            f"{path}: a sample has {drive.max():.2f} times the light of its primaries: a white"
+            f" subpixel, as of a panel that is no sum of red, green and blue; {CCSS_ADVICE}"
         )
     primaries = samples[lit[three]]
     order = np.argsort(-(primaries @ nm) / primaries.sum(axis=1))
@@ -207,8 +209,8 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
         if off[chosen[-1]] > FAR_XY:
             near = ", ".join(f"{value:.3f}" for value in seen_xy[chosen[-1]])
             raise InputError(
-                f"[monitor.primaries] xy_{name} = {list(wanted)}: the nearest Gaussian of {fwhm_nm:g} nm has [{near}]; write"
-                " another width_nm, or measured spectra as file"
+                f"[monitor.primaries] xy_{name} = {list(wanted)}: the nearest Gaussian of"
+                f" {fwhm_nm:g} nm has [{near}]; write another width_nm, or measured spectra as file"
             )
     white = np.array([D65_XY[0], D65_XY[1], 1 - sum(D65_XY)]) / D65_XY[1]
     amounts = (
@@ -216,7 +218,8 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
     )
     if not (amounts > 0).all():
         raise InputError(
-            "[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those of r, g and b"
+            "[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those"
+            " of r, g and b"
         )
     return _curves(XY_NM, spectra[chosen] * amounts[:, None])
 
@@ -249,7 +252,8 @@ def channel_matrix(
     )
     if not matrix.any():
         raise InputError(
-            "[monitor.primaries] file: the tracker detects none of this light; check that both are in nm"
+            "[monitor.primaries] file: the tracker detects none of this light; check that both are"
+            " in nm"
         )
     parted = np.linalg.matrix_rank(matrix) == min(matrix.shape)
     condition = float(np.linalg.cond(matrix)) if parted else None

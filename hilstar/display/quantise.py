@@ -61,7 +61,8 @@ class Panel:
             np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()
         ):
             raise InputError(
-                "the uniformity map has pixels that are not positive; give each pixel its light relative to the mean"
+                "the uniformity map has pixels that are not positive; give each pixel its light"
+                " relative to the mean"
             )
 
     def gain(self) -> Float32Array | None:

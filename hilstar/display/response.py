@@ -109,7 +109,8 @@ def bit_stealing_response(
     bits = channels[0].bits
     if (2**bits - 1) * TRIPLES + 1 > MAX_LEVELS:
         raise InputError(
-            f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; use it with at most 13 bits"
+            f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; use it with at most"
+            " 13 bits"
         )
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     # (0, 0, 0) first; (1, 1, 1) is the next grey

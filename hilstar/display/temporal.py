@@ -34,8 +34,8 @@ class TemporalQuantiser(ExactQuantiser):
     """Levels of one frame after another, each of which makes up for what the last one left."""
 
     words = (
-        "and so that each frame makes up for what the one before left, by which the mean of any N frames is about N times as "
-        "right."
+        "and so that each frame makes up for what the one before left, by which the mean of any N"
+        " frames is about N times as right."
     )
     weights = OVER_FRAMES
     remembers = True

@@ -496,7 +496,8 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
         folds = not (a * d - b * c > 0).all()
     if folds:
         raise InputError(
-            "its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms"
+            "its distortion folds within the screen: two directions share a pixel; fit it again,"
+            " with fewer terms"
         )
     return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER, box=box))
 

@@ -114,7 +114,8 @@ def smeared_sprites(
     row_s = scan.scanout_s / camera.resolution_px[1]
     if fastest_px_s * row_s > MAX_ROWS_A_ROW:
         raise InputError(
-            f"the camera turns by {fastest_px_s * row_s:.3g} px while a row is read; shorten row_time_us or turn more slowly"
+            f"the camera turns by {fastest_px_s * row_s:.3g} px while a row is read; shorten"
+            " row_time_us or turn more slowly"
         )
     # Each piece of the turn is short compared with the field and, anywhere on the image, with its
     # nodes.
@@ -124,7 +125,8 @@ def smeared_sprites(
     if needed > MAX_PIECES:
         max_deg = np.degrees(angle_rad / needed * MAX_PIECES)
         raise InputError(
-            f"{turn} is too long; at most {max_deg:.4g} deg can be drawn here: write a shorter exposure_s or a slower rate"
+            f"{turn} is too long; at most {max_deg:.4g} deg can be drawn here: write a shorter"
+            " exposure_s or a slower rate"
         )
     pieces = int(np.ceil(needed))
     fineness = 1.0
@@ -148,7 +150,8 @@ def smeared_sprites(
             )
         fineness *= COARSER
     raise InputError(
-        f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars"
+        f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate"
+        " or fewer stars"
     )
 
 

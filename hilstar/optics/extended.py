@@ -180,9 +180,11 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
         from scipy.ndimage import shift
 
         image, cover = (
-            None
-            if one is None
-            else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
+            (
+                None
+                if one is None
+                else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
+            )
             for one, most in ((light.image, np.inf), (light.cover, 1.0))
         )
         corner = light.corner_px[0] - 1, light.corner_px[1] - 1

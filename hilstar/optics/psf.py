@@ -323,7 +323,8 @@ class SampledPsf(Psf):
             raise InputError(f"a PSF of {self.per_px} samples a pixel; write 1 or more")
         if not np.isfinite(samples).all() or samples.sum() <= 0:
             raise InputError(
-                "a PSF has samples that are not finite, or no light; write finite ones with a positive sum"
+                "a PSF has samples that are not finite, or no light; write finite ones with a"
+                " positive sum"
             )
         # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the
         # largest of those below zero
@@ -334,17 +335,18 @@ class SampledPsf(Psf):
         )
         if negative > self.max_negative:
             raise InputError(
-                f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample it more finely than "
-                f"{self.per_px} a pixel"
+                f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample"
+                f" it more finely than {self.per_px} a pixel"
             )
         if least < 1 - MAX_UNEVEN:
             raise InputError(
-                f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and more at others: it is not "
-                "pixel-integrated; write PIXINT = F"
+                f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and"
+                " more at others: it is not pixel-integrated; write PIXINT = F"
             )
         if self.cut_share(MAX_FOOTPRINT_PX) > MAX_SAMPLED_CUT:
             raise InputError(
-                f"a PSF's light reaches over more than {MAX_FOOTPRINT_PX} px; cut off what lies further out"
+                f"a PSF's light reaches over more than {MAX_FOOTPRINT_PX} px; cut off what lies"
+                " further out"
             )
 
     def _before_cut(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -565,11 +567,13 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
         raise InputError(f"{path}: not a FITS image; {FILE_ADVICE}")
     if image.ndim == 3 and len(image) > 1:
         raise InputError(
-            f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write one of them"
+            f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write one"
+            " of them"
         )
     if type(per_px) is not int or type(integrated) is not bool:
         raise InputError(
-            f"{path}: OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T or F"
+            f"{path}: OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T"
+            " or F"
         )
     try:
         return SampledPsf(image.astype(np.float64), per_px, integrated)

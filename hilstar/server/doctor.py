@@ -65,7 +65,9 @@ class Check:
 
     def line(self) -> str:
         """For a person."""
-        return f"{'ok' if self.ok else 'MISSING' if self.required else 'none':8}{self.name:12}{self.detail}"
+        absence = "MISSING" if self.required else "none"
+        state = "ok" if self.ok else absence
+        return f"{state:8}{self.name:12}{self.detail}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +149,8 @@ class BenchReport:
         if fault is not None and remedy is not None:
             yield from (f"{'':20}{line}" for line in (fault, *remedy.lines()))
         if self.monitor.now is not None:
-            yield f"{'CHANGED' if self.monitor.fault else 'ok':8}{'monitor':12}{self.monitor.now.name()}"
+            state = "CHANGED" if self.monitor.fault else "ok"
+            yield f"{state:8}{'monitor':12}{self.monitor.now.name()}"
             yield from [f"{'':20}{self.monitor.notice}"] * bool(self.monitor.notice)
 
 
@@ -188,7 +191,10 @@ def _gl() -> str:
     try:
         return described()
     except MachineError as error:
-        until_then = "until then NumPy draws frame, simulate and verify, slower; serve, replay and demo need OpenGL"
+        until_then = (
+            "until then NumPy draws frame, simulate and verify, slower; serve, replay and demo need"
+            " OpenGL"
+        )
         raise MachineError(f"{error}; {until_then}") from error
 
 
@@ -210,13 +216,19 @@ def _zeromq() -> str:
         sender.put(b"ping")
         if not receiver.receive(2000):
             raise MachineError("a loopback message does not arrive; allow TCP on 127.0.0.1")
-        return f"ZeroMQ {zmq_version()}, loopback message in {(time.perf_counter() - begin) * 1e3:.2f} ms"
+        return (
+            f"ZeroMQ {zmq_version()}, loopback message in"
+            f" {(time.perf_counter() - begin) * 1e3:.2f} ms"
+        )
 
 
 def _catalogue() -> str:
     begin = time.perf_counter()
     catalog = load_catalog()
-    return f"Hipparcos, {len(catalog)} of {catalog.rows_read} stars, loaded in {(time.perf_counter() - begin) * 1e3:.0f} ms"
+    return (
+        f"Hipparcos, {len(catalog)} of {catalog.rows_read} stars, loaded in"
+        f" {(time.perf_counter() - begin) * 1e3:.0f} ms"
+    )
 
 
 def _gpus() -> Check:
@@ -276,7 +288,10 @@ def _machine() -> str:
         system = f"{platform.freedesktop_os_release()['PRETTY_NAME']}, Linux"
     # The numbers of the kernel's release alone: what follows them may name somebody.
     release = re.match(r"(?:\d+(?:\.\d+)*)?", platform.release())
-    return f"{model}, {os.cpu_count()} cores, {platform.machine()}; {system} {release[0] if release else ''}"
+    return (
+        f"{model}, {os.cpu_count()} cores, {platform.machine()}; {system}"
+        f" {release[0] if release else ''}"
+    )
 
 
 def _opengl() -> str:

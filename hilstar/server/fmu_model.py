@@ -150,7 +150,10 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             tuple(getattr(self, name) for name in RATE),
         )
         if not abs(math.hypot(*q) - 1.0) <= NORM_TOLERANCE or not all(map(math.isfinite, rate)):
-            line = f"q has the norm {math.hypot(*q):.6g}, rate is {rate}; connect a unit quaternion, w first"
+            line = (
+                f"q has the norm {math.hypot(*q):.6g}, rate is {rate}; connect a unit quaternion, w"
+                " first"
+            )
             self.log(line, Fmi2Status.error)
             return False
         t_s = current_time if self.t_s == COMMUNICATION_POINT else self.t_s

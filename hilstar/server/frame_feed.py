@@ -73,9 +73,11 @@ class FrameFeed(Closing):
         on_screen = shown.predicted_swap_ns is not None
         copied.head = FrameHead(
             frame=shown.number,
-            lit_ns=shown.swap_ns + self._swap_to_light_ns()
-            if on_screen
-            else shown.draw_ns - self._half_period_ns,
+            lit_ns=(
+                shown.swap_ns + self._swap_to_light_ns()
+                if on_screen
+                else shown.draw_ns - self._half_period_ns
+            ),
             width=levels.shape[1],
             height=levels.shape[0],
             bits=monitor.bits,

@@ -178,4 +178,7 @@ def wrong_line(judged: Judged) -> str:
     )
     late_ms = (judged.answer.host_ns - judged.middle_ns) / NS_PER_MS
     frames = f"frames {lit.first} to {lit.last}"
-    return f"the tracker's answer is off by {off / scale:.{digits}f} {unit} ({parts}) in {frames}, {late_ms:.0f} ms ago"
+    return (
+        f"the tracker's answer is off by {off / scale:.{digits}f} {unit} ({parts}) in {frames},"
+        f" {late_ms:.0f} ms ago"
+    )

@@ -278,7 +278,10 @@ class FrameLoop:
         self.tally.blank_frames += shown.missing
         if drawn.capped:
             if not self.tally.capped_frames:
-                line = f"frame {shown.number}: the turn is too fast for full paths; {drawn.capped} stars are drawn coarser, with"
+                line = (
+                    f"frame {shown.number}: the turn is too fast for full paths; {drawn.capped}"
+                    " stars are drawn coarser, with"
+                )
                 self.notices.tell(
                     "capped", f"{line} all their light (further such frames are only counted)"
                 )

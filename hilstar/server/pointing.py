@@ -21,7 +21,10 @@ from hilstar.sky.catalog import star_names
 from hilstar.sky.constellations import constellation_of
 
 POINTING = "points-at"
-LINE_ENDS = "compare with the simulator; if it points elsewhere, its quaternions are of another [attitude] convention"
+LINE_ENDS = (
+    "compare with the simulator; if it points elsewhere, its quaternions are of another [attitude]"
+    " convention"
+)
 
 
 class Pointing:

@@ -227,7 +227,8 @@ def plan_play(
 def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:
     if wanted.step_s is not None or wanted.speed not in {1.0, math.inf}:
         raise InputError(
-            f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step"
+            f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no"
+            " --step"
         )
     start_s, stop_s = _span(log, wanted, (last.swap_ns - first.swap_ns) / NS_PER_S)
 
@@ -242,7 +243,8 @@ def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) 
     count = sum(1 for _ in kept())
     if not count:
         raise InputError(
-            f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span"
+            f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer"
+            " span"
         )
     play = played_again(
         kept,
@@ -287,7 +289,10 @@ def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices)
     now = DrawnBy(printable(renderer.gl_renderer), printable(renderer.gl_version), renderer.path)
     if before is not None and before != now:
         share = before.other_codes(now, renderer.target.quantisation)
-        line = f"the run was drawn by {before}, and is now by {now}: at most {share:.2g} of a frame's lit pixels"
+        line = (
+            f"the run was drawn by {before}, and is now by {now}: at most {share:.2g} of a frame's"
+            " lit pixels"
+        )
         notices.tell("other-renderer", f"{line} may be one code off")
 
 
@@ -296,7 +301,8 @@ def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
     stop_s = length_s if wanted.stop_s is None else wanted.stop_s
     if not 0 <= start_s <= stop_s <= length_s + 1e-9:
         raise InputError(
-            f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length, {length_s:g}"
+            f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length,"
+            f" {length_s:g}"
         )
     return start_s, stop_s
 

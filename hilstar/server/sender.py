@@ -140,7 +140,8 @@ class UdpSender(TwoWay):
         match = UDP.fullmatch(to)
         if match is None or not 0 < int(match[3]) < 65_536:
             raise InputError(
-                f"{shortened(to)}: write udp://HOST:PORT, such as udp://127.0.0.1:5560 or udp://[::1]:5560"
+                f"{shortened(to)}: write udp://HOST:PORT, such as udp://127.0.0.1:5560 or"
+                " udp://[::1]:5560"
             )
         try:
             self._datagrams = Datagrams.connected(match[1] or match[2], int(match[3]))
@@ -254,7 +255,8 @@ class Sender(Closing):
         )
         if len(q) != 4 or (rate is not None and len(rate) != 3):
             raise InputError(
-                f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a rate of 3"
+                f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a"
+                " rate of 3"
             )
         sample = checked_sample(at_ns, q, rate, self._sequence, discontinuity)
         if isinstance(sample, Refusal):

@@ -310,7 +310,10 @@ class LockstepRun:
                 f"a {type(event).__name__} packet; a request is an attitude, or a time request",
             )
         if refusal is not None and self.counts.refuse(refusal):
-            line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
+            line = (
+                f"message refused ({refusal.reason}): {refusal.detail}; further ones are only"
+                " counted"
+            )
             self._loop.notices.mention("refused", line)
         shown = None
         if refusal is None and sample is not None:
@@ -361,8 +364,9 @@ class StatusMaker:
             protocol.HEALTH_MISSED: missed > self._missed,
             protocol.HEALTH_REFUSED: refused > self._refused,
             protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
-            protocol.HEALTH_LEDGER_FAILED: self._ledger is not None
-            and self._ledger.failure is not None,
+            protocol.HEALTH_LEDGER_FAILED: (
+                self._ledger is not None and self._ledger.failure is not None
+            ),
             protocol.HEALTH_OPERATOR_OVERRIDE: bool(on_screen.operator),
             protocol.HEALTH_HIDDEN: bool(on_screen.hidden),
             protocol.HEALTH_SECOND_SENDER: self._happens(loop.notices, "second-sender"),

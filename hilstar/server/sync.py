@@ -56,7 +56,8 @@ class Exposures:
         ):
             if not math.isfinite(value) or value < 0 or (zero_is_wrong and not value):
                 raise InputError(
-                    f"{name} = {value:g}: write a finite number{' above 0' if zero_is_wrong else ', 0 or more'}"
+                    f"{name} = {value:g}: write a finite"
+                    f" number{' above 0' if zero_is_wrong else ', 0 or more'}"
                 )
 
     @property
@@ -320,7 +321,10 @@ def beat_line(found: BeatSummary) -> str | None:
         if found.period_s is None
         else f"in a beat of {found.period_s:.3g} s"
     )
-    subject = f"exposures of {found.exposure_s:g} s are {found.refreshes_per_exposure:.4g} refreshes of {found.refresh_hz:.6g} Hz"
+    subject = (
+        f"exposures of {found.exposure_s:g} s are {found.refreshes_per_exposure:.4g} refreshes of"
+        f" {found.refresh_hz:.6g} Hz"
+    )
     proposal, ways = found.proposal or BeatProposal(), []
     if proposal.refresh_hz is not None:
         ways.append(f"[monitor] refresh_hz = {proposal.refresh_hz:.6g}")
@@ -360,4 +364,7 @@ class SyncSummary(msgspec.Struct, frozen=True, kw_only=True):
             told += f", lost {self.lost} times"
         if self.delay_ms is None or self.jitter_ms is None:
             return told
-        return f"{told}; {self.delay_ms:.3f} ms after their frames, jitter {self.jitter_ms:.3f} ms (standard deviation)"
+        return (
+            f"{told}; {self.delay_ms:.3f} ms after their frames, jitter {self.jitter_ms:.3f} ms"
+            " (standard deviation)"
+        )

@@ -118,7 +118,8 @@ class FrameWatch:
                 stuck = stages[-1]
                 self._notices.tell(
                     "frame-stuck",
-                    f"frame {number} hangs in its stage {stuck[0]} since {(now_ns - stuck[1]) / NS_PER_S:.1f} s",
+                    f"frame {number} hangs in its stage {stuck[0]} since"
+                    f" {(now_ns - stuck[1]) / NS_PER_S:.1f} s",
                 )
 
     def __enter__(self) -> Self:

@@ -198,7 +198,8 @@ class SiteAir:
             tell(
                 self.told,
                 "sun",
-                "[site]: the Sun stands at %.1f degrees there and then; above -12 the sky is brighter than [site] says",
+                "[site]: the Sun stands at %.1f degrees there and then; above -12 the sky is"
+                " brighter than [site] says",
                 altitude_deg,
             )
 

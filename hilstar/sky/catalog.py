@@ -110,7 +110,10 @@ class Catalog:
         count = int(
             np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES]).sum()
         ) - len(known)
-        note = f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch of phase have their mean"
+        note = (
+            f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch"
+            " of phase have their mean"
+        )
         return replace(self, v_mag=v_mag, notes=(*self.notes, note))
 
     def brighter_than(self, faintest_v_mag: float) -> "Catalog":
@@ -257,7 +260,8 @@ RANGES: dict[str, tuple[float, float]] = {
 def _parse_row(row: list[str], where: str) -> list[int] | None:
     if len(row) != COLUMN_COUNT or row[0] != "H":
         raise InputError(
-            f"{where}: not a row of hip_main.dat ({COLUMN_COUNT} fields after 'H|'); give the CDS I/239 file"
+            f"{where}: not a row of hip_main.dat ({COLUMN_COUNT} fields after 'H|'); give the CDS"
+            " I/239 file"
         )
     steps: dict[str, int] = {}
     for name, (column, per_unit) in FIELDS.items():
@@ -275,14 +279,16 @@ def _parse_row(row: list[str], where: str) -> list[int] | None:
         if not low <= value <= high:
             shown = shortened(text)
             raise InputError(
-                f"{where}: field {column} ({name}) is {shown!r}; write a number from {low:g} to {high:g}"
+                f"{where}: field {column} ({name}) is {shown!r}; write a number from {low:g} to"
+                f" {high:g}"
             )
         steps[name] = round(value * per_unit)
     for name, column in LETTERS.items():
         text = row[column].strip()
         if len(text) > 1 or not text.isascii():
             raise InputError(
-                f"{where}: field {column} ({name}) is {shortened(text)!r}; write one letter, or none"
+                f"{where}: field {column} ({name}) is {shortened(text)!r}; write one letter, or"
+                " none"
             )
         steps[name] = ord(text) if text else 0
     return [*steps.values()]

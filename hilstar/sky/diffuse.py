@@ -21,7 +21,10 @@ from hilstar.basics.reading import read_bytes
 from hilstar.sky.electrons import VEGA_V0_W_M2_M
 
 MAP_ADVICE = "give a FITS image with a WCS, or a HEALPix map in FITS"
-UNIT_ADVICE = "write BUNIT (of a HEALPix column TUNITn) as astropy does, such as mag/arcsec2, MJy/sr or W/(m2 um sr)"
+UNIT_ADVICE = (
+    "write BUNIT (of a HEALPix column TUNITn) as astropy does, such as mag/arcsec2, MJy/sr or W/(m2"
+    " um sr)"
+)
 MAX_FILE_BYTES = 1_000_000_000
 V_NM = 545.0  # effective wavelength of V, for which VEGA_V0_W_M2_M is given (Bessell 1998)
 MAX_HALF_DEG = 40.0  # a tangent image's pixels are 1.7 times as long at its edge
@@ -197,7 +200,8 @@ def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     system = str(header.get("COORDSYS", "")).strip().upper()[:1]
     if system not in frames:
         raise InputError(
-            f"{path}: COORDSYS = {header.get('COORDSYS')!r}; write G (galactic), C (ICRS) or E (ecliptic)"
+            f"{path}: COORDSYS = {header.get('COORDSYS')!r}; write G (galactic), C (ICRS) or E"
+            " (ecliptic)"
         )
     light = brightness(path, np.ravel(hdu.data.field(0)), header.get("TUNIT1"))
     grid = HEALPix(int(header["NSIDE"]), str(header["ORDERING"]).strip().lower())

@@ -171,9 +171,13 @@ def electron_response(optics: Optics) -> tuple[FloatArray, FloatArray]:
     """
     wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     electrons_per_j = wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    return wavelength_nm, optics.quantum_efficiency(wavelength_nm) * optics.transmission(
-        wavelength_nm
-    ) * electrons_per_j * weight_m
+    return (
+        wavelength_nm,
+        optics.quantum_efficiency(wavelength_nm)
+        * optics.transmission(wavelength_nm)
+        * electrons_per_j
+        * weight_m,
+    )
 
 
 def dgs_electrons_per_s(
@@ -254,7 +258,8 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
     domain = [1.0 / high_k, 1.0 / low_k]
     if not (dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, optics, photometry) > 0):
         raise InputError(
-            "tracker: quantum efficiency times transmission is zero everywhere; no star gives an electron"
+            "tracker: quantum efficiency times transmission is zero everywhere; no star gives an"
+            " electron"
         )
     if model == "ags":
         return RateTable(
@@ -268,7 +273,8 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
     table = Chebyshev.interpolate(log_rate, TABLE_DEGREE, domain=domain)
     if not np.isfinite(table.coef).all():
         raise InputError(
-            "tracker: detects no light of the coolest stars at all; give a quantum efficiency that reaches 400 nm"
+            "tracker: detects no light of the coolest stars at all; give a quantum efficiency that"
+            " reaches 400 nm"
         )
     return RateTable(table)
 
@@ -461,6 +467,7 @@ def _check_range(library: Library, optics: Optics) -> None:
     seen_nm = nodes_nm[optics.quantum_efficiency(nodes_nm) * optics.transmission(nodes_nm) > 0]
     if len(seen_nm) and (seen_nm[0] < low_nm or seen_nm[-1] > high_nm):
         raise InputError(
-            f"tracker: detects {seen_nm[0]:.0f} to {seen_nm[-1]:.0f} nm, and the Pickles spectra run from {low_nm:g} to "
+            f"tracker: detects {seen_nm[0]:.0f} to {seen_nm[-1]:.0f} nm, and the Pickles spectra"
+            f" run from {low_nm:g} to "
             f'{high_nm:g} nm; write spectrum = "blackbody", or cut the quantum efficiency'
         )

@@ -209,11 +209,13 @@ def _nm_of(table: TextTable, wavelength: Chosen, wavelengths: FloatArray) -> flo
     if not wavelength.has_unit:
         if unit is None:
             raise InputError(
-                f"{table.path}: {span} without a unit; write it in the header: {', '.join(UNIT_HEADERS.values())}"
+                f"{table.path}: {span} without a unit; write it in the header:"
+                f" {', '.join(UNIT_HEADERS.values())}"
             )
         if unit != "nm":
             table.notices.append(
-                f"{span} without a unit are taken as {unit}; {UNIT_HEADERS['nm']} says that they are nm"
+                f"{span} without a unit are taken as {unit}; {UNIT_HEADERS['nm']} says that they"
+                " are nm"
             )
         size = factor(unit, "nm")
         return 1.0 if size is None else float(size)
@@ -322,7 +324,8 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     knots = knots[(knots >= low) & (knots <= high) & (np.diff(knots, prepend=-np.inf) > 0)]
     if len(knots) < 2:
         raise InputError(
-            "the quantum efficiency and the transmission share no wavelength; check that both are in nm"
+            "the quantum efficiency and the transmission share no wavelength; check that both are"
+            " in nm"
         )
     pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)
     # number within its interval, from 0

@@ -82,8 +82,8 @@ OVERLAP_LIMIT_MAG = 0.03  # limit for the median
 FEW_MATCHES, BRIGHT_STARS, BRIGHT_V_MAG = 0.5, 20, 7.0
 RAD_PER_ARCSEC = np.pi / (180 * 3600)
 NO_IDENTIFIER = (
-    "no identifier of their own (blank, repeated, or a floating-point number: its 15 digits hold no source_id); all are named"
-    " by their rows"
+    "no identifier of their own (blank, repeated, or a floating-point number: its 15 digits hold no"
+    " source_id); all are named by their rows"
 )
 VERSION = 3  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
@@ -139,7 +139,8 @@ def assemble(
     kept = reason == 0
     if not kept.any():
         raise InputError(
-            f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)}); {table_reader.COLUMNS_WANTED}"
+            f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)});"
+            f" {table_reader.COLUMNS_WANTED}"
         )
     dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
     epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
@@ -198,7 +199,10 @@ class _Columns:
         values = np.asarray(self.table.columns[column], dtype=np.float64)
         if factor == 1.0:
             return values
-        notice = f"column {column} is in {self.table.unit.get(column)}, and is multiplied by {factor:.9g}"
+        notice = (
+            f"column {column} is in {self.table.unit.get(column)}, and is multiplied by"
+            f" {factor:.9g}"
+        )
         if notice not in self.notices:
             self.notices.append(notice)
         return values * factor
@@ -211,7 +215,8 @@ class _Columns:
         largest = float(np.nanmax(self.table.columns[name], initial=0.0))
         if turn is not None and largest > turn + ROUNDED:
             raise InputError(
-                f"{self.path}: column {name} is in {unit} and runs to {largest:g}; name it ra_deg if it is in degrees"
+                f"{self.path}: column {name} is in {unit} and runs to {largest:g}; name it ra_deg"
+                " if it is in degrees"
             )
 
     def places_doubt(self) -> str:
@@ -227,7 +232,10 @@ class _Columns:
         base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
         if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
-            return f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad"
+            return (
+                f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or"
+                " dec_rad"
+            )
         if low >= 0 and high < HOURS_A_TURN:
             return f"{base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}"
         return ""
@@ -346,20 +354,23 @@ class _Columns:
         if known is None and designation == "Gaia DR3":
             known = GAIA_DR3_JYEAR
         if stated_jyear is not None:
-            return np.full(
-                self.table.row_count, stated_jyear
-            ), f"places of J{stated_jyear:g} as stated"
+            return (
+                np.full(self.table.row_count, stated_jyear),
+                f"places of J{stated_jyear:g} as stated",
+            )
         if "epoch_jyear" in self.layout.role:
             values = self.role("epoch_jyear", np.nan)
             if not ((values > EPOCHS_JYEAR[0]) & (values < EPOCHS_JYEAR[1])).all():
                 raise InputError(
-                    f"{self.path}: column {self.layout.role['epoch_jyear']} is no Julian year; {_STATE_EPOCH}"
+                    f"{self.path}: column {self.layout.role['epoch_jyear']} is no Julian year;"
+                    f" {_STATE_EPOCH}"
                 )
             return values, f"places of J{float(np.median(values)):g} by its column"
         if known is not None:
-            return np.full(
-                self.table.row_count, known
-            ), f"places of J{known:g} by its columns' names"
+            return (
+                np.full(self.table.row_count, known),
+                f"places of J{known:g} by its columns' names",
+            )
         if dated:
             raise InputError(
                 f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}"
@@ -476,9 +487,10 @@ def _nearest_owner(
     chord, owner = tree.query(
         unit_vectors_icrs(table, epoch_jyear), distance_upper_bound=reach * RAD_PER_ARCSEC
     )
-    return np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1), np.asarray(
-        chord
-    ) / RAD_PER_ARCSEC
+    return (
+        np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1),
+        np.asarray(chord) / RAD_PER_ARCSEC,
+    )
 
 
 def _held(
@@ -521,8 +533,9 @@ def _differences(
     median_mag, wide_mag = float(np.median(v_mag)), float(np.quantile(np.abs(v_mag), 0.95))
     odd = int((np.abs(v_mag) > ODD_MAG).sum())
     words = (
-        f"{of_both} stars of Hipparcos are among them, of {len(star)} single constant ones V differs by {median_mag:+.3f} mag"
-        f" in the median ({wide_mag:.3f} at 95 %, {odd} by more than {ODD_MAG:g}) and B-V by {float(np.median(bv_mag)):+.3f}"
+        f"{of_both} stars of Hipparcos are among them, of {len(star)} single constant ones V"
+        f" differs by {median_mag:+.3f} mag in the median ({wide_mag:.3f} at 95 %, {odd} by more"
+        f" than {ODD_MAG:g}) and B-V by {float(np.median(bv_mag)):+.3f}"
     )
     return _Differences(len(star), median_mag, words)
 
@@ -531,11 +544,15 @@ def _doubt(table: Catalog, held: npt.NDArray[np.bool_], difference: _Differences
     bright = table.v_mag < BRIGHT_V_MAG
     if bright.sum() >= BRIGHT_STARS and held[bright].mean() < FEW_MATCHES:
         return (
-            f"of its {int(bright.sum())} stars to V = {BRIGHT_V_MAG:g} Hipparcos has {held[bright].mean():.0%} at their place;"
-            " are its places ICRS degrees, and of the epoch that it gives?"
+            f"of its {int(bright.sum())} stars to V = {BRIGHT_V_MAG:g} Hipparcos has"
+            f" {held[bright].mean():.0%} at their place; are its places ICRS degrees, and of the"
+            " epoch that it gives?"
         )
     if difference.count and abs(difference.median_mag) > OVERLAP_LIMIT_MAG:
-        return f"its V differs by {difference.median_mag:+.3f} mag from Hipparcos' in the median; are these magnitudes V?"
+        return (
+            f"its V differs by {difference.median_mag:+.3f} mag from Hipparcos' in the median; are"
+            " these magnitudes V?"
+        )
     return None
 
 
@@ -674,7 +691,8 @@ def choose_catalog(choice: TableChoice) -> Catalog:
     if packaged or _is_hip_main(Path(choice.source)):
         if choice.with_hipparcos:
             raise InputError(
-                "[sky] with_hipparcos adds a table's stars to Hipparcos; name a table as [sky] catalogue"
+                "[sky] with_hipparcos adds a table's stars to Hipparcos; name a table as [sky]"
+                " catalogue"
             )
         if choice.epoch_jyear is not None:
             raise InputError(

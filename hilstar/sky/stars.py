@@ -323,9 +323,11 @@ def with_bodies(
         catalog=stars.catalog,
         row=np.concatenate([stars.row, np.full(count, -1)]),
         bodies=(*stars.bodies, *bodies),
-        colours=None
-        if stars.colours is None or colours is None
-        else np.vstack([stars.colours, np.broadcast_to(colours, (count, colours.shape[-1]))]),
+        colours=(
+            None
+            if stars.colours is None or colours is None
+            else np.vstack([stars.colours, np.broadcast_to(colours, (count, colours.shape[-1]))])
+        ),
         colours_by_bv=stars.colours_by_bv,
     )
 

@@ -128,8 +128,8 @@ ERROR_NAMES: dict[str, tuple[str, ...]] = {
     SPECTRAL_TYPE: ("sptype", "sp_type", "spectral_type", "mk"),
 }
 COLUMNS_WANTED = (
-    "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag with bp_rp or with "
-    "phot_bp_mean_mag and phot_rp_mean_mag"
+    "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag"
+    " with bp_rp or with phot_bp_mean_mag and phot_rp_mean_mag"
 )
 MAX_NAMED = 12
 HOURS = ("h", "hr", "hrs", "hour", "hours", "hourangle")
@@ -280,7 +280,8 @@ def layout_of(
     if not places:
         pairs = ", ".join(f"{ra} and {dec}" for ra, dec in PLACES[:4])
         raise InputError(
-            f"{path}: has no right ascension and declination among its columns ({found}); name them {pairs}"
+            f"{path}: has no right ascension and declination among its columns ({found}); name them"
+            f" {pairs}"
         )
     if not magnitudes:
         raise InputError(
@@ -349,7 +350,8 @@ def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
         )
     except (ValueError, TypeError, u.UnitConversionError) as error:
         raise InputError(
-            f"{path}: column {column} is in {shortened(unit)!r}; give it in {wanted.replace(' ', '')}"
+            f"{path}: column {column} is in {shortened(unit)!r}; give it in"
+            f" {wanted.replace(' ', '')}"
         ) from error
 
 
@@ -617,8 +619,8 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
     whole = name in {layout.role.get(role) for role in Whole}
     if values.dtype.kind not in "iufb":
         raise InputError(
-            f"{path}: column {name} is no column of numbers (its first is {str(values.flat[0])[:40]!r}); write decimal figures,"
-            " places in degrees"
+            f"{path}: column {name} is no column of numbers (its first is"
+            f" {str(values.flat[0])[:40]!r}); write decimal figures, places in degrees"
             if values.size
             else f"{path}: has no rows; {FILE_WANTED}"
         )

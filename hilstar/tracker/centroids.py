@@ -278,7 +278,8 @@ def find_stars(
 def _check(image: npt.NDArray[Any]) -> None:
     if image.ndim != 2 or 0 in image.shape or image.dtype.kind not in "fiu":
         raise InputError(
-            f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height, width)"
+            f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height,"
+            " width)"
         )
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError(
@@ -450,7 +451,7 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     )
     if any((np.diff(curve.measured_px) <= 0).any() for curve in curves):
         raise InputError(
-            f"centroids: window_sigma_px = {settings.window_sigma_px:g} is too narrow for psf_sigma_px = "
-            f"{settings.psf_sigma_px}; write 1 or more"
+            f"centroids: window_sigma_px = {settings.window_sigma_px:g} is too narrow for"
+            f" psf_sigma_px = {settings.psf_sigma_px}; write 1 or more"
         )
     return curves

@@ -5,8 +5,8 @@ Cosmic rays and false stars are new in every frame.
 
 The physical order, which is the order of `Detector.expose`:
 
-    light (+ frame-transfer smear, false stars) -> PRNU gain -> + dark -> Poisson -> + cosmic rays -> full well (and blooming)
-    -> column pattern -> read noise -> ADC
+    light (+ frame-transfer smear, false stars) -> PRNU gain -> + dark -> Poisson
+    -> + cosmic rays -> full well (and blooming) -> column pattern -> read noise -> ADC
 
 Laws:
 1. What belongs to the device (PRNU, DSNU, hot and dead pixels, columns) comes from `device_seed`,
@@ -277,7 +277,8 @@ class Detector:
         light_e = np.asarray(mean_e)
         if light_e.dtype.kind not in "fiu" or light_e.shape != self.shape:
             raise InputError(
-                f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}"
+                f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers,"
+                f" {self.shape}"
             )
         if not 0 <= exposure_s <= MAX_E:
             raise InputError(f"exposure {exposure_s} s; write 0 or more seconds")
@@ -298,7 +299,8 @@ class Detector:
         largest_e = expected_e.max()
         if not largest_e <= MAX_E:
             raise InputError(
-                f"{largest_e:.3g} electrons in one pixel, at most {MAX_E:g} can be simulated; shorten the exposure"
+                f"{largest_e:.3g} electrons in one pixel, at most {MAX_E:g} can be simulated;"
+                " shorten the exposure"
             )
 
     def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:

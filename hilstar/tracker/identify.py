@@ -135,7 +135,8 @@ class LostInSpace:
             import tetra3rs
         except ImportError as error:
             raise InputError(
-                '--solver tetra3: needs the extra hilstar[solve]; run pip install "hilstar[solve]", or write --solver truth'
+                '--solver tetra3: needs the extra hilstar[solve]; run pip install "hilstar[solve]",'
+                " or write --solver truth"
             ) from error
         self._result = tetra3rs.SolveResult
         width, height = size_px

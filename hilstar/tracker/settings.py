@@ -171,18 +171,21 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         for name in ("temperature_k", "dark_reference_temperature_k"):
             if self.dark_law in E2V_DARK and not low_k <= getattr(self, name) <= high_k:
                 raise InputError(
-                    f'{name} = {getattr(self, name):g}; dark_law "{self.dark_law}" holds from {low_k:g} to {high_k:g} K: '
-                    'write such a temperature, or dark_law = "arrhenius"'
+                    f'{name} = {getattr(self, name):g}; dark_law "{self.dark_law}" holds from'
+                    f" {low_k:g} to {high_k:g} K: write such a temperature, or dark_law ="
+                    ' "arrhenius"'
                 )
         _check_shutter(self)
         for name in ("column_noise_e", "column_dark_e_per_s"):
             if self.fixed_pattern == "ccd" and getattr(self, name) > 0:
                 raise InputError(
-                    f'{name} is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", or {name} = 0'
+                    f"{name} is for CMOS, whose columns have an amplifier each; write fixed_pattern"
+                    f' = "cmos", or {name} = 0'
                 )
         if self.dark_distribution != "normal" and self.dsnu_e_per_s and not self.dark_e_per_s:
             raise InputError(
-                f'dark_distribution = "{self.dark_distribution}" has no mean of 0; write dark_e_per_s above 0'
+                f'dark_distribution = "{self.dark_distribution}" has no mean of 0; write'
+                " dark_e_per_s above 0"
             )
         hz = [point[0] for point in self.read_noise_table]
         if (
@@ -191,8 +194,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             and not (sorted(set(hz)) == hz and hz[0] <= self.readout_hz <= hz[-1])
         ):
             raise InputError(
-                f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table, whose frequencies rise: "
-                f"{hz[0]:g} to {hz[-1]:g}"
+                f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table,"
+                f" whose frequencies rise: {hz[0]:g} to {hz[-1]:g}"
             )
 
     @property
@@ -300,7 +303,8 @@ def _check_shutter(detector: DetectorSettings) -> None:
         if (getattr(detector, name) > 0) != (detector.shutter == shutter):
             way = "above 0" if detector.shutter == shutter else f'= 0, or shutter = "{shutter}"'
             raise InputError(
-                f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write {name} {way}'
+                f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write'
+                f" {name} {way}"
             )
 
 
@@ -343,7 +347,8 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
     if law == "normal":
         if middle < 0:
             raise InputError(
-                'dark_quantiles: their normal law has a mean below 0; write dark_distribution = "gamma"'
+                "dark_quantiles: their normal law has a mean below 0; write dark_distribution ="
+                ' "gamma"'
             )
         return middle, slope
     mean = math.exp(middle + slope**2 / 2)

@@ -415,10 +415,12 @@ def test_settings_that_make_no_sense_are_refused(wrong):
 
 if __name__ == "__main__":
     print(
-        "largest bias, noiseless, px; scatter (both axes) over SNR 10, 30, 100, px, and the share found at 4 sigma"
+        "largest bias, noiseless, px; scatter (both axes) over SNR 10, 30, 100, px, and the share"
+        " found at 4 sigma"
     )
     print(
-        "sigma  window   bias     corrected   SNR 10            SNR 30            SNR 100           predicted 30, 100"
+        "sigma  window   bias     corrected   SNR 10            SNR 30            SNR 100          "
+        " predicted 30, 100"
     )
     for sigma in SIGMAS_PX:
         for window in ("gaussian", "plain"):
@@ -427,7 +429,8 @@ if __name__ == "__main__":
                 raw = replace(raw, window_radius_px=math.ceil(3 * sigma) + 1)
             known = replace(raw, psf_sigma_px=(sigma, sigma))
             cells = [
-                f"{sigma:5} {window:9}{np.abs(bias_px(sigma, raw)).max():.1e}  {np.abs(bias_px(sigma, known)).max():.1e} "
+                f"{sigma:5} {window:9}{np.abs(bias_px(sigma, raw)).max():.1e} "
+                f" {np.abs(bias_px(sigma, known)).max():.1e} "
             ]
             for signal_to_noise in (10.0, *FIRST_ORDER_SNR):
                 got = measure(sigma, signal_to_noise, known, seed=11)

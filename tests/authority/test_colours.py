@@ -189,7 +189,8 @@ def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, 
         np.testing.assert_allclose(drive @ white, rows["electrons_per_s"], rtol=P95)
         inside = np.abs(reach - means[1]) < 1e-6
         print(
-            f"{panel}, {sensor}: {1 - inside.mean():.1%} of stars beyond the primaries' mean wavelengths"
+            f"{panel}, {sensor}: {1 - inside.mean():.1%} of stars beyond the primaries' mean"
+            " wavelengths"
         )
 
 

@@ -103,8 +103,9 @@ def dark_frames(settings: DetectorSettings, exposure_s: float, seed: int) -> dic
     return {
         "dark_e_per_s": float(dark.mean() - bias.mean()) * e_per_s,
         "dsnu_e_per_s": math.sqrt(spatial_variance(dark)) * e_per_s,
-        "dark_shot_noise_e": math.sqrt(temporal_variance(dark) - temporal_variance(bias))
-        * settings.gain_e_per_dn,
+        "dark_shot_noise_e": (
+            math.sqrt(temporal_variance(dark) - temporal_variance(bias)) * settings.gain_e_per_dn
+        ),
     }
 
 

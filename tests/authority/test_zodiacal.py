@@ -41,8 +41,8 @@ from tests.support.benches import SMALL_BENCH
 
 WHEN = "2026-03-01T06:00:00"
 BENCH = (
-    SMALL_BENCH
-    + f'[sky]\nepoch_utc = "{WHEN}Z"\nfaintest_v_mag = 1.0\n[background]\nzodiacal = "leinert1998"\n'
+    SMALL_BENCH + f'[sky]\nepoch_utc = "{WHEN}Z"\nfaintest_v_mag = 1.0\n[background]\nzodiacal ='
+    ' "leinert1998"\n'
 )
 LON_DEG, LAT_DEG = np.r_[0:50:5, 60:195:15], np.r_[0:35:5, 45:91:15]
 # Typed in from the paper's table 17: |longitude from the Sun|, |latitude|, 1e-8 W m-2 sr-1 um-1.
@@ -202,7 +202,9 @@ def test_a_frame_has_the_light_of_each_of_its_directions(simulator):
 def test_a_field_near_the_sun_is_refused_and_a_run_goes_on_with_a_warning(simulator, caplog):
     with pytest.raises(
         InputError,
-        match=r"\[background\] zodiacal: the field comes within \d\.\d deg of the Sun.*; look farther",
+        match=(
+            r"\[background\] zodiacal: the field comes within \d\.\d deg of the Sun.*; look farther"
+        ),
     ):
         simulator.expose(look(simulator, 3.0, 2.0), None)
     with Simulator(simulator.file, refuse=False) as running, caplog.at_level(logging.WARNING):

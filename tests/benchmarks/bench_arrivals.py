@@ -256,9 +256,11 @@ def run(
             process("show", str(file), way, str(seconds + 2 * WARM_UP_S), before=before) as shown,
         ):
             where = [
-                int(shown.stdout.readline().strip().rpartition(":")[2].partition("@")[0] or 0)
-                if road == "udp"
-                else 0
+                (
+                    int(shown.stdout.readline().strip().rpartition(":")[2].partition("@")[0] or 0)
+                    if road == "udp"
+                    else 0
+                )
             ]
             if road != "udp":
                 shown.stdout.readline()

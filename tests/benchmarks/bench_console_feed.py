@@ -45,7 +45,8 @@ def main() -> None:
             feed.see(frame)
             took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
         print(
-            f"numbers of a frame: {np.median(took_us):.1f} us median, {np.percentile(took_us, 99):.1f} us p99"
+            f"numbers of a frame: {np.median(took_us):.1f} us median,"
+            f" {np.percentile(took_us, 99):.1f} us p99"
         )
         memory.want = PictureRequest(1, 2**62)
         took_us = []
@@ -56,7 +57,8 @@ def main() -> None:
             took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
         size = "x".join(map(str, levels.shape[::-1]))
         print(
-            f"with a picture of {size}: {np.median(took_us):.0f} us median, {np.percentile(took_us, 99):.0f} us p99"
+            f"with a picture of {size}: {np.median(took_us):.0f} us median,"
+            f" {np.percentile(took_us, 99):.0f} us p99"
         )
         took_us = []
         for k in range(50):

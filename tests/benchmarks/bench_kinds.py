@@ -35,8 +35,9 @@ GLASS = "planar-1897.fits"
 KINDS: dict[str, Tables] = {
     "grey": {},
     "three primaries, mono": PANEL,
-    "three primaries, Bayer": PANEL
-    | {"tracker": {f"quantum_efficiency_{c}": f"{c}.csv" for c in DYES_NM}},
+    "three primaries, Bayer": (
+        PANEL | {"tracker": {f"quantum_efficiency_{c}": f"{c}.csv" for c in DYES_NM}}
+    ),
     "glass": {"tracker.optics": {"psf": GLASS}, "render": {"psf": "tracker"}},
 }
 

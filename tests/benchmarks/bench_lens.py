@@ -76,9 +76,9 @@ def main() -> None:
         )
     for speed, (ideal, bent) in zip(SPEEDS_DEG_S, np.median(found[5:], axis=0), strict=True):
         print(
-            f"{speed:4g} deg/s  sprites {ideal[0]:5.2f} and {bent[0]:5.2f} ms: {bent[0] - ideal[0]:+.2f} ms   "
-            f"frame {ideal[1]:6.2f} and {bent[1]:6.2f} ms: {bent[1] - ideal[1]:+.2f} ms   "
-            f"({ideal[2]:.0f} and {bent[2]:.0f} sprites)"
+            f"{speed:4g} deg/s  sprites {ideal[0]:5.2f} and {bent[0]:5.2f} ms:"
+            f" {bent[0] - ideal[0]:+.2f} ms   frame {ideal[1]:6.2f} and {bent[1]:6.2f} ms:"
+            f" {bent[1] - ideal[1]:+.2f} ms   ({ideal[2]:.0f} and {bent[2]:.0f} sprites)"
         )
 
 

@@ -109,11 +109,12 @@ def tell(name: str, sent: dict, summary: dict, bare_ms: np.ndarray) -> None:
     # both processes have one clock
     least_ms = clock["offset_ms"] if clock["mode"] == "one-way" else 0.0
     print(
-        f"{name:24} sent {sent['sent']} of {sent['packets']} (corrupted {sent['corrupted']}, reordered {sent['reordered']}),"
-        f" accepted {packets['accepted']}, refused {packets['refused_by']}\n"
-        f"{'':24} latency p50 {latency['p50'] + least_ms:.3f}, p99 {latency['p99'] + least_ms:.3f} ms;"
-        f" bare road p50 {np.percentile(bare_ms, 50):.3f}, p99 {np.percentile(bare_ms, 99):.3f} ms;"
-        f" clock {clock['mode']} {clock['offset_ms']:.3f} +- {clock['uncertainty_ms']:.3f} ms, {clock['drift_ppm']:.2f} ppm;"
+        f"{name:24} sent {sent['sent']} of {sent['packets']} (corrupted {sent['corrupted']},"
+        f" reordered {sent['reordered']}), accepted {packets['accepted']}, refused"
+        f" {packets['refused_by']}\n{'':24} latency p50 {latency['p50'] + least_ms:.3f}, p99"
+        f" {latency['p99'] + least_ms:.3f} ms; bare road p50 {np.percentile(bare_ms, 50):.3f}, p99"
+        f" {np.percentile(bare_ms, 99):.3f} ms; clock {clock['mode']} {clock['offset_ms']:.3f} +-"
+        f" {clock['uncertainty_ms']:.3f} ms, {clock['drift_ppm']:.2f} ppm;"
         f" {summary['missed_frames']} frames of {summary['frames']} missed"
     )
 

@@ -69,7 +69,8 @@ def main(
             {name: run[name] for name in ("frames", "missed_frames", "stale_frames") if name in run}
         )
         print(
-            f"memory {memory_mb[warm].min():.1f} to {memory_mb[warm].max():.1f} MB; {slope:+.1f} +- {error:.1f} MB a day"
+            f"memory {memory_mb[warm].min():.1f} to {memory_mb[warm].max():.1f} MB; {slope:+.1f} +-"
+            f" {error:.1f} MB a day"
         )
         with ledger.open("rb") as file:
             summary = make_reader(file).get_summary()
@@ -78,7 +79,8 @@ def main(
         )
         print(f"of it the ledger's index {index_bytes / 1e6 / seconds * DAY_S:.1f} MB a day")
         print(
-            f"ledger {ledger.stat().st_size / 1e6:.1f} MB, {ledger.stat().st_size / 1e9 / seconds * DAY_S:.2f} GB a day"
+            f"ledger {ledger.stat().st_size / 1e6:.1f} MB,"
+            f" {ledger.stat().st_size / 1e9 / seconds * DAY_S:.2f} GB a day"
         )
 
 

@@ -13,7 +13,8 @@ import re
 from dataclasses import dataclass, field
 
 FENCE = re.compile(
-    r"(?:^<!-- (?P<note>[^\n]*) -->\n)?^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?[^\n]*\n(?P<text>.*?)^```$",
+    r"(?:^<!-- (?P<note>[^\n]*) -->\n)?^```(?P<language>\w*)(?:"
+    r" title=\"(?P<title>[^\"]+)\")?[^\n]*\n(?P<text>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
 # the first is a version, as 3.11.2

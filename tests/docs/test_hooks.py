@@ -36,11 +36,14 @@ def test_a_link_out_of_the_documentation_names_the_file(page, built):
 
 def test_a_page_from_elsewhere_links_into_the_documentation():
     page = SimpleNamespace(file=SimpleNamespace(src_uri="examples.md"))
-    text = "see [campaigns](../docs/campaign.md#cases) and [a header](../firmware_protocol/hilstar_protocol.h)"
+    text = (
+        "see [campaigns](../docs/campaign.md#cases) and [a"
+        " header](../firmware_protocol/hilstar_protocol.h)"
+    )
     built = docs_hooks.on_page_markdown(text, page=page)
     assert (
-        built
-        == "see [campaigns](campaign.md#cases) and a header (`firmware_protocol/hilstar_protocol.h`)"
+        built == "see [campaigns](campaign.md#cases) and a header"
+        " (`firmware_protocol/hilstar_protocol.h`)"
     )
 
 

@@ -19,9 +19,10 @@ def test_links_lead_somewhere(page):
         name, _, heading = link.partition("#")
         target = page.parent / name if name else page
         assert target.exists(), link
-        assert ROOT in [target.resolve(), *target.resolve().parents], (
-            f"{link} leads out of the checkout"
-        )
+        assert ROOT in [
+            target.resolve(),
+            *target.resolve().parents,
+        ], f"{link} leads out of the checkout"
         if heading:
             assert heading in slugs_of(target.read_text()), link
 

@@ -35,7 +35,8 @@ def test_a_slew_settles_by_nothing_but_the_trackers_answers(tmp_path):
     assert found["answers"] > 0
     if found["answers"] < MIN_ANSWERS or found["answer_age_ms"] > MAX_AGE_MS:
         pytest.skip(
-            f"a busy machine: {found['answers']} answers of 90, {found['answer_age_ms']:.0f} ms old in the middle"
+            f"a busy machine: {found['answers']} answers of 90, {found['answer_age_ms']:.0f} ms old"
+            " in the middle"
         )
     assert found["pointing_rms_arcsec"]["x"] < ACROSS_ARCSEC
     assert found["pointing_rms_arcsec"]["y"] < ACROSS_ARCSEC

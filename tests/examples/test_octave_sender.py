@@ -54,7 +54,10 @@ def test_its_packets_are_those_of_python_bit_for_bit(rng):
         # A literal is a double, and exact to 2^53 only.
         high, low = divmod(sample.t_ns, 2**31)
         t_ns = f"int64({high}) * int64({2**31}) + int64({low})"
-        call = f"hilstar_packet({sample.sequence}, {t_ns}, [{q}], [{rate}], {str(sample.discontinuity).lower()})"
+        call = (
+            f"hilstar_packet({sample.sequence}, {t_ns}, [{q}], [{rate}],"
+            f" {str(sample.discontinuity).lower()})"
+        )
         lines.append(f"printf('%02x', {call}); printf('\\n');\n")
     result = octave("".join(lines))
     assert result.stdout.split() == [encode(sample).hex() for sample in samples], result.stderr

@@ -14,7 +14,10 @@ from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 NO_SUCH_CAPABILITY = 0x1234
-TRIANGLE = "void main() { gl_Position = vec4(gl_VertexID / 2 * 4.0 - 1.0, gl_VertexID % 2 * 4.0 - 1.0, 0.0, 1.0); }"
+TRIANGLE = (
+    "void main() { gl_Position = vec4(gl_VertexID / 2 * 4.0 - 1.0, gl_VertexID % 2 * 4.0 - 1.0,"
+    " 0.0, 1.0); }"
+)
 
 
 @pytest.fixture

@@ -191,7 +191,7 @@ def test_what_is_forced_stays_on_status_page_and_ledger(here, tmp_path):
             process.kill()
     assert process.returncode == 0, told
     assert "this is DEL DELL P2423D" in told and "shown anyway (--force)" in told
-    (line, _) = json.loads(out)["screen"]["forced"]  # the other one: swaps do not wait
+    line, _ = json.loads(out)["screen"]["forced"]  # the other one: swaps do not wait
     assert "another monitor" in line
     events = [
         one for one in run_records(ledger) if isinstance(one, EventRecord) and one.kind == "forced"
@@ -269,7 +269,10 @@ def test_old_files_are_refused_by_their_date_and_undated_or_built_in_ones_are_no
     )
     noticed = run_hilstar_here("doctor", measured_bench(tmp_path, None, "some day in spring"))
     assert noticed.returncode == 0
-    lacking = "response.toml names no monitor and no date; geometry.toml names no monitor and no date: whether this"
+    lacking = (
+        "response.toml names no monitor and no date; geometry.toml names no monitor and no date:"
+        " whether this"
+    )
     assert noticed.stdout.count(lacking) == 1
     built_in = played(bench(tmp_path), "--force")
     assert (

@@ -89,7 +89,8 @@ def test_nvidia_s_settings_are_asked_of_its_tool_where_its_driver_runs(here, mon
     """A stand-in for nvidia-settings; no such driver was there."""
     tool = tmp_path / "nvidia-settings"
     tool.write_text(
-        '#!/bin/sh\ncase "$3" in *CurrentDithering) echo 1;; *ColorRange) echo 0;; *) echo ERROR;; esac\n'
+        '#!/bin/sh\ncase "$3" in *CurrentDithering) echo 1;; *ColorRange) echo 0;; *) echo ERROR;;'
+        " esac\n"
     )
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")

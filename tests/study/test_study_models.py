@@ -330,7 +330,8 @@ def test_titles_say_what_the_tables_hold(study):
     assert choices_finding(
         {"zero": np.array([0.31, 0.31]), "b ags": np.array([0.16, 0.32])}
     ).endswith(
-        "zero changes most: half of Hipparcos to V = 7.5 by 0.31 mag and more; a twentieth are changed most by ags, by 0.32 mag"
+        "zero changes most: half of Hipparcos to V = 7.5 by 0.31 mag and more; a twentieth are"
+        " changed most by ags, by 0.32 mag"
     )
     table = columns(folder / "spectra.csv")
     for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
@@ -402,9 +403,10 @@ def test_a_title_is_whole_in_even_lines():
 
 def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
     code = (
-        "import sys, tempfile; from pathlib import Path; from hilstar.instruments.study import models;"
-        "assert 'matplotlib' not in sys.modules;"
-        "models.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
+        "import sys, tempfile; from pathlib import Path; from hilstar.instruments.study import"
+        " models;assert 'matplotlib' not in"
+        " sys.modules;models.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not"
+        " in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE_S)
 

@@ -88,7 +88,10 @@ def on_duty() -> Iterator[str]:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         try:
-            yield f"{sys.executable} -S -E {Path(__file__).with_name('snapshot.py')} {server.server_address[1]}"
+            yield (
+                f"{sys.executable} -S -E {Path(__file__).with_name('snapshot.py')}"
+                f" {server.server_address[1]}"
+            )
         finally:
             server.shutdown()
             thread.join()

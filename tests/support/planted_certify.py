@@ -125,16 +125,16 @@ def plant(
         "".join(",".join(map(repr, row)) + "\n" for row in grid.tolist())
     )
     (folder / "true-light.toml").write_text(
-        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\n'
-        'response = "true-response.csv"\n[uniformity]\nfile = "true-even.csv"\n'
+        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits'
+        ' = 8\nresponse = "true-response.csv"\n[uniformity]\nfile = "true-even.csv"\n'
     )
     a, b, c = (angle / 3600 / 57.29577951308232 / 2 for angle in one.mount_arcsec)
     w = float(np.sqrt(1 - a * a - b * b - c * c))
     (folder / "true-lens.toml").write_text(
-        'kind = "hilstar geometry 1"\nresolution_px = [1920, 1080]\n'
-        f"focal_length_px = {350e3 / 57.65 * (1 + one.focal)!r}\nprincipal_point_px = [959.5, 539.5]\n"
-        f"q_cam_to_mon = [{w!r}, {a!r}, {b!r}, {c!r}]\ntilt_deg = [{one.tilt_deg[0]!r}, {one.tilt_deg[1]!r}]\n"
-        f"k1 = {one.k1!r}\nk2 = {one.k2!r}\n"
+        'kind = "hilstar geometry 1"\nresolution_px = [1920, 1080]\nfocal_length_px ='
+        f" {350e3 / 57.65 * (1 + one.focal)!r}\nprincipal_point_px = [959.5, 539.5]\nq_cam_to_mon ="
+        f" [{w!r}, {a!r}, {b!r}, {c!r}]\ntilt_deg = [{one.tilt_deg[0]!r}, {one.tilt_deg[1]!r}]\nk1"
+        f" = {one.k1!r}\nk2 = {one.k2!r}\n"
     )
     bench = BENCH.format(calibration="srgb", delay_ms=8.0, geometry="", white=2.6e6)
     truth = BENCH.format(
@@ -145,8 +145,8 @@ def plant(
     )
     (folder / "bench.toml").write_text(bench + bench_keys)
     (folder / "truth.toml").write_text(
-        f"{truth}[certify.virtual]\nreading_noise = {one.reading_noise!r}\ndot_noise_px = {one.dot_noise_px!r}\n"
-        f"drift_percent_per_h = {one.drift_percent_per_h!r}\n{truth_keys}"
+        f"{truth}[certify.virtual]\nreading_noise = {one.reading_noise!r}\ndot_noise_px ="
+        f" {one.dot_noise_px!r}\ndrift_percent_per_h = {one.drift_percent_per_h!r}\n{truth_keys}"
     )
     return folder / "bench.toml", folder / "truth.toml"
 

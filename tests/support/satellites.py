@@ -32,8 +32,8 @@ def element_set(
     inclination, node, perigee, anomaly = angles_deg
     first = f"1 {number:05d}U 98067A   {EPOCH} -.00002182  00000-0 -11606-4 0  292"
     second = (
-        f"2 {number:05d} {inclination:8.4f} {node:8.4f} {round(eccentricity * 1e7):07d} {perigee:8.4f} {anomaly:8.4f}"
-        f" {turns_a_day:11.8f}56353"
+        f"2 {number:05d} {inclination:8.4f} {node:8.4f} {round(eccentricity * 1e7):07d}"
+        f" {perigee:8.4f} {anomaly:8.4f} {turns_a_day:11.8f}56353"
     )
     return f"{with_checksum(first)}\n{with_checksum(second)}\n"
 

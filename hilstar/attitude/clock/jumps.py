@@ -306,7 +306,10 @@ class JumpFilter:
 
 
 def _too_early(each: _Doubtful) -> SampleArrival:
-    detail = f"t_ns {each.arrival.event.t_ns} is {-each.late_ns / NS_PER_S:.3g} s ahead of the sender's clock so far"
+    detail = (
+        f"t_ns {each.arrival.event.t_ns} is {-each.late_ns / NS_PER_S:.3g} s ahead of the sender's"
+        " clock so far"
+    )
     return replace(each.arrival, refusal=Refusal("time", detail))
 
 
@@ -401,8 +404,9 @@ class KnownClockFilter:
             return
         self._notices.begin(
             BEHIND,
-            f'[attitude] clock = "{self._clock.mode}", and each packet comes {quickest_ns / NS_PER_MS:.0f} ms or more after its'
-            " t_ns: the link is as slow, or the sender's clock as far behind; then the sky is drawn as far ahead",
+            f'[attitude] clock = "{self._clock.mode}", and each packet comes'
+            f" {quickest_ns / NS_PER_MS:.0f} ms or more after its t_ns: the link is as slow, or the"
+            " sender's clock as far behind; then the sky is drawn as far ahead",
         )
 
     def _line(self, late_ns: int) -> str:
@@ -415,8 +419,8 @@ class KnownClockFilter:
         looks = "" if (other := clock_named(late_ns)) is None else f", as {other} is"
         wrong = "" if late_ns > 0 else f"; the sky drawn is {-late_ns / NS_PER_S:.3f} s old"
         return (
-            f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this machine{looks}{wrong}:'
-            ' stamp with that clock, or write clock = "estimated"'
+            f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this'
+            f' machine{looks}{wrong}: stamp with that clock, or write clock = "estimated"'
         )
 
     def forgive(self) -> None:

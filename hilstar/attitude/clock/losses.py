@@ -122,7 +122,10 @@ class TimeUnit:
         for unit_pace, (name, factor) in UNITS.items():
             if abs(pace / unit_pace - 1) < share:
                 send = "send nanoseconds" + (f": multiply by {factor}" if factor else "")
-                line = f"t_ns runs at {pace:.3g} times real time: it is in {name}, not in nanoseconds; {send}"
+                line = (
+                    f"t_ns runs at {pace:.3g} times real time: it is in {name}, not in nanoseconds;"
+                    f" {send}"
+                )
                 self.named, self._others = name, 0
                 self._notices.begin(UNIT, line)
                 return

@@ -236,7 +236,10 @@ class RateCheck:
         if self.cause is None and found.lag_s:
             self._late = found
             late = "late" if found.lag_s > 0 else "early"
-            text = f"they are {abs(found.lag_s) * NS_PER_S / NS_PER_MS:.0f} ms {late}: they fit the turn of another moment"
+            text = (
+                f"they are {abs(found.lag_s) * NS_PER_S / NS_PER_MS:.0f} ms {late}: they fit the"
+                " turn of another moment"
+            )
             self._begin(
                 Cause(text, SAME, lag_s=found.lag_s), stretch, self._history.from_ns, host_ns
             )
@@ -259,8 +262,9 @@ class RateCheck:
         )
         if cause.reading is not None:
             return (
-                f"the packets' rates do not fit their quaternions as they are read; {cause.text}: the sky is drawn at another"
-                f" place; {cause.reading.advice} (both turn at {turn_deg_s:.3g} deg/s)"
+                f"the packets' rates do not fit their quaternions as they are read; {cause.text}:"
+                f" the sky is drawn at another place; {cause.reading.advice} (both turn at"
+                f" {turn_deg_s:.3g} deg/s)"
             )
         done = (
             "the sky is drawn by the quaternions' own turn"
@@ -270,8 +274,9 @@ class RateCheck:
         if not self._used:
             done = "nothing is drawn by them"
         return (
-            f"the packets' rates are wrong, probably because {cause.text}: the quaternions turn at {turn_deg_s:.3g} deg/s, the"
-            f" rates say {rate_rad_s:.3g} rad/s ({math.degrees(rate_rad_s):.3g} deg/s); {done} ([attitude] check_rates)"
+            f"the packets' rates are wrong, probably because {cause.text}: the quaternions turn at"
+            f" {turn_deg_s:.3g} deg/s, the rates say {rate_rad_s:.3g} rad/s"
+            f" ({math.degrees(rate_rad_s):.3g} deg/s); {done} ([attitude] check_rates)"
         )
 
     def _end(self, why: str) -> None:

@@ -62,7 +62,10 @@ class Resolution:
         # Each component is off by step / sqrt(12) rms, and the attitude by twice that about each of
         # three axes.
         arcsec = 2 * math.sqrt(3 / 12) * step * ARCSEC_PER_RAD
-        line = f"the quaternions come in steps of {step:.3g}: each attitude is off by {arcsec:.3g} arcsec rms"
+        line = (
+            f"the quaternions come in steps of {step:.3g}: each attitude is off by {arcsec:.3g}"
+            " arcsec rms"
+        )
         self._say(COARSE, f"{line}; send all their digits")
 
 

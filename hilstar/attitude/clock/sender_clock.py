@@ -423,8 +423,8 @@ class SenderClock:
             self.mode,
             offset_ms=(self._base_ns + line.offset_ns) / NS_PER_MS,
             drift_ppm=0.0 - line.drift * 1e6,
-            uncertainty_ms=(uncertainty_ns + behind_ns) / NS_PER_MS
-            if math.isfinite(uncertainty_ns)
-            else None,
+            uncertainty_ms=(
+                (uncertainty_ns + behind_ns) / NS_PER_MS if math.isfinite(uncertainty_ns) else None
+            ),
             exchanges=self._exchanges.count,
         )

@@ -82,8 +82,8 @@ BODY_FRAME = re.compile(
 OF_DATE_FRAME = re.compile("MOD|TOD|TEME|ITRF-?([0-9]{2}|[0-9]{4})?")
 OfDate = Callable[[str, str, npt.NDArray[np.int64]], tuple[FloatArray, FloatArray, str | None]]
 AMBIGUOUS = (
-    f"{ccsds.EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are"
-    " not used"
+    f"{ccsds.EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an"
+    " angular velocity; they are not used"
 )
 QUARTER_TURN_DEG = 90.0
 ADVICE = "sort its lines; leap seconds are not counted, so write TAI across one"
@@ -220,8 +220,9 @@ def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[Lo
     several = [group for group in groups if len(group) > 1]
     if several:
         told["aem-overlap"] = (
-            f"{sum(map(len, several))} segments overlap, first at {ccsds.epoch_text(several[0][1].times[0])}: where they do,"
-            " the one that its USEABLE times give is taken, and of several the one that begins later"
+            f"{sum(map(len, several))} segments overlap, first at"
+            f" {ccsds.epoch_text(several[0][1].times[0])}: where they do, the one that its USEABLE"
+            " times give is taken, and of several the one that begins later"
         )
     return [group[0].entries if len(group) == 1 else _one_run(group) for group in groups]
 
@@ -272,7 +273,7 @@ def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
     ]
     own = {
         entry.event.t_ns
-        for entry in (piece[:1] + piece[-1:])
+        for entry in piece[:1] + piece[-1:]
         if isinstance(entry.event, AttitudeSample)
     }
     if start_ns not in own:
@@ -453,7 +454,8 @@ def _rate_in_cam(meta: dict[str, str], q: FloatArray, rate: FloatArray) -> Float
     if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == ccsds.RATE:
         raise ccsds.AemFaultError(
             "",
-            f"{ccsds.RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {ccsds.DERIVATIVE}",
+            f"{ccsds.RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write"
+            f" {ccsds.DERIVATIVE}",
         )
     a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
     frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)

@@ -162,7 +162,10 @@ def _fault_of(key: str, section: str, version: str) -> str | None:
         own, instead = ONLY_IN.get(key, (version, ""))
         if own == version or version not in STATES:
             return None
-        return f"{key} is of AEM {own}, and {VERSION_KEY} is {version}; {instead}: delete it, or write {VERSION_KEY} = {own}"
+        return (
+            f"{key} is of AEM {own}, and {VERSION_KEY} is {version}; {instead}: delete it, or write"
+            f" {VERSION_KEY} = {own}"
+        )
     other = "metadata" if section == "header" else "header"
     if key in SECTIONS[other]:
         return f"{key} is in the {section}; it belongs in the {other}"
@@ -194,7 +197,8 @@ def _check_metadata(meta: dict[str, str], where: str) -> None:
         types = ", ".join(STATES[version])
         raise AemFaultError(
             where,
-            f"ATTITUDE_TYPE = {meta['ATTITUDE_TYPE'][:40]} of AEM {version} is not read; write one of {types}",
+            f"ATTITUDE_TYPE = {meta['ATTITUDE_TYPE'][:40]} of AEM {version} is not read; write one"
+            f" of {types}",
         )
 
 
@@ -212,7 +216,8 @@ def sequence(meta: dict[str, str]) -> tuple[int, int, int]:
     if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
         raise AemFaultError(
             "",
-            f"EULER_ROT_SEQ is {text[:40]}; write three axes such as 321 or ZYX, no two alike side by side",
+            f"EULER_ROT_SEQ is {text[:40]}; write three axes such as 321 or ZYX, no two alike side"
+            " by side",
         )
     return axes[0], axes[1], axes[2]
 
@@ -270,7 +275,8 @@ def kvn_blocks(text: str) -> list[Block]:
             if section != MARKERS[line][0]:
                 raise AemFaultError(
                     where,
-                    f"{line} in the {section}; the order is META_START, META_STOP, DATA_START, DATA_STOP",
+                    f"{line} in the {section}; the order is META_START, META_STOP, DATA_START,"
+                    " DATA_STOP",
                 )
             section = MARKERS[line][1]
             if line == "META_START":
@@ -288,7 +294,8 @@ def kvn_blocks(text: str) -> list[Block]:
     if section != "header" or not blocks:
         raise AemFaultError(
             f":{number}",
-            f"the file ends in the {section}, with {len(blocks)} complete blocks of data; is it cut off?",
+            f"the file ends in the {section}, with {len(blocks)} complete blocks of data; is it cut"
+            " off?",
         )
     return blocks
 
@@ -298,7 +305,8 @@ def _keyword(line: str, section: str, version: str, where: str) -> tuple[str, st
     if not equals or section not in {"header", "metadata"}:
         raise AemFaultError(
             where,
-            f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START",
+            f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as"
+            " META_START",
         )
     fault = _fault_of(key.strip(), section, version)
     if fault is not None:
@@ -531,7 +539,8 @@ def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
         key = _key(path, leaf, wanted, meta)
         if key not in wanted or key in found:
             raise leaf.unlike(
-                f"<{leaf.name[:40]}> {'appears twice' if key in found else 'has no place'} in a <{name}>"
+                f"<{leaf.name[:40]}> {'appears twice' if key in found else 'has no place'} in a"
+                f" <{name}>"
             )
         found[key] = _number(leaf, key)
     missing = [path for path in wanted if path not in found]

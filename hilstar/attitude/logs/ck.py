@@ -57,7 +57,8 @@ def _kernels_beside(path: Path) -> list[Path]:
         ]
     except OSError as error:
         raise InputError(
-            f"{path}: its folder cannot be searched for kernels ({error.strerror}); give --kernel FILE"
+            f"{path}: its folder cannot be searched for kernels ({error.strerror}); give --kernel"
+            " FILE"
         ) from error
     if len(files) > MAX_BESIDE:
         raise InputError(
@@ -99,7 +100,10 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
         told.append(
             (
                 "ck-step",
-                f"read every {said['step_s']:.4g} s where the CK is a function of time; off by {error} between",
+                (
+                    f"read every {said['step_s']:.4g} s where the CK is a function of time; off by"
+                    f" {error} between"
+                ),
             )
         )
     gaps_s = said["gaps_s"]
@@ -160,9 +164,11 @@ def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, d
 def _conventions(said: dict[str, Any]) -> Conventions:
     return Conventions(
         f"SPICE CK, structure {said['structure']}",
-        f"the C-matrix turns components of {', '.join(said['references'])} (by SPICE: J2000, the ICRF) into the structure's",
+        f"the C-matrix turns components of {', '.join(said['references'])} (by SPICE: J2000, the"
+        " ICRF) into the structure's",
         "scalar first, as m2q gives it for the C-matrix",
-        "TDB from 1970-01-01T00:00:00 TDB (ephemeris time + 946728000 s), from clock ticks by the SCLK kernel",
+        "TDB from 1970-01-01T00:00:00 TDB (ephemeris time + 946728000 s), from clock ticks by the"
+        " SCLK kernel",
         of_body=True,
         written=lambda q: f"m2q(C), C from J2000 = {components(q)}",
         scale="TDB",

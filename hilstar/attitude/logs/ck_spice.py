@@ -130,7 +130,8 @@ def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray
         count += 1
         if count > MAX_SUMMARIES:
             raise InputError(
-                f"{path}: has more than {MAX_SUMMARIES} segments; split it, or copy it again if it is damaged"
+                f"{path}: has more than {MAX_SUMMARIES} segments; split it, or copy it again if it"
+                " is damaged"
             )
         summary_doubles, summary_integers = spice.dafus(
             spice.dafgs(MAX_SUMMARY_WORDS), doubles, integers
@@ -151,7 +152,8 @@ def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
         start, stop = float(ticks[0]), float(ticks[1])
         if not (math.isfinite(start) and math.isfinite(stop) and 0 <= start <= stop):
             raise InputError(
-                f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file damaged?"
+                f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file"
+                " damaged?"
             )
         if kind not in TYPES:
             raise InputError(f"{path}: segment {number} is of type {kind}; types 1 to 6 are read")
@@ -238,7 +240,8 @@ def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Cove
         spans = own_epochs[[0, -1]].reshape(1, 2) if segment.kind == 1 else own_intervals
         if not np.isfinite(spans).all() or (np.diff(spans.ravel()) < 0).any():
             raise InputError(
-                f"{path}: segment {segment.number}: its intervals do not increase; is the file damaged?"
+                f"{path}: segment {segment.number}: its intervals do not increase; is the file"
+                " damaged?"
             )
         within = np.clip(spans, segment.start, segment.stop)
         is_covered = (within[:, 1] > within[:, 0]) | (spans[:, 1] == spans[:, 0])
@@ -390,7 +393,8 @@ class _Structure:
         matrix, _, found = self.spice.ckgp(self.body, tick, 0, FRAME)
         if not found:
             raise InputError(
-                f"{self.path}: SPICE has no attitude of {self.body} at tick {tick:.17g}, which its segments cover"
+                f"{self.path}: SPICE has no attitude of {self.body} at tick {tick:.17g}, which its"
+                " segments cover"
             )
         return np.asarray(matrix, dtype=np.float64)
 
@@ -467,7 +471,8 @@ def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
     ticks = [piece.ticks(step) for piece in pieces]
     if sum(map(len, ticks)) > MAX_SAMPLES:
         raise InputError(
-            f"{structure.path}: contains more than {MAX_SAMPLES} attitudes; cut it into several (ckslicer)"
+            f"{structure.path}: contains more than {MAX_SAMPLES} attitudes; cut it into several"
+            " (ckslicer)"
         )
     broken, gaps_s = _parted(structure, pieces, ticks)
     step_s = (
@@ -626,7 +631,8 @@ def _named(spice: Any, meta: Path) -> list[Path]:
         spice.dvpool(name)
     if not files or len(symbols) != len(values):
         raise InputError(
-            f"{meta}: names no kernels; write KERNELS_TO_LOAD, and as many PATH_VALUES as PATH_SYMBOLS"
+            f"{meta}: names no kernels; write KERNELS_TO_LOAD, and as many PATH_VALUES as"
+            " PATH_SYMBOLS"
         )
     for symbol, value in sorted(zip(symbols, values, strict=True), key=lambda pair: -len(pair[0])):
         files = [file.replace(f"${symbol}", value) for file in files]
@@ -648,9 +654,15 @@ def _in_words(error: Any) -> str:
     """What SPICE says, and what to give where a kernel is missing."""
     said = shortened(" ".join(str(error.long or error.explain or error.short).split()), 300)
     if "SCLK" in said and ("not found" in said or "kernel" in said.lower()):
-        return f"its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc ({said})"
+        return (
+            "its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc"
+            f" ({said})"
+        )
     if "frame" in said.lower():
-        return f"a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc ({said})"
+        return (
+            "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its"
+            f" own .bc, or .tpc ({said})"
+        )
     return f"SPICE refuses it ({said})"
 
 
@@ -706,7 +718,8 @@ def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -
             body = body if found else None
     if body is None or body not in bodies:
         raise InputError(
-            f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its frame kernel"
+            f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its"
+            " frame kernel"
         )
     return body
 

@@ -1,7 +1,8 @@
 """Rotations from the ICRS to frames of date, to the turning Earth and to a local level; and the
 reference frame of a log.
 
-    ICRS --C(X, Y, s)--> CIRS --R3(ERA)--> TIRS --W(polar motion)--> ITRS --R2(-latitude - 90 deg) R3(longitude)--> NED
+    ICRS --C(X, Y, s)--> CIRS --R3(ERA)--> TIRS --W(polar motion)--> ITRS
+    ITRS --R2(-latitude - 90 deg) R3(longitude)--> NED
 
 IERS Conventions (2010), chapter 5: precession and nutation of IAU 2006/2000A, the Earth rotation
 angle of UT1, and UT1-UTC and polar motion from the IERS table in Astropy's package: nothing is
@@ -46,7 +47,10 @@ TT_FROM_TAI_S = 32.184
 # rate of the Earth rotation angle: 2 pi 1.00273781191135448 a day of UT1 (IAU 2000)
 EARTH_RATE_RAD_S = 7.292115146706979e-5
 UT1_ARCSEC_PER_S = 15.041
-TURNED = "turned to the ICRS with the Earth (IAU 2006/2000A; 15 arcsec for each second that its UTC is off)"
+TURNED = (
+    "turned to the ICRS with the Earth (IAU 2006/2000A; 15 arcsec for each second that its UTC is"
+    " off)"
+)
 # UT1-TAI, held at the ends of the table, has moved by this in a year since 1973 at most (days 3 ms
 # long)
 UT1_S_A_YEAR = 1.1
@@ -152,8 +156,9 @@ def beyond_table(first_ns: int, last_ns: int) -> str | None:
     )
     off = UT1_ARCSEC_PER_S * UT1_S_A_YEAR * max(1.0, beyond_days / 365.25)
     return (
-        f"the table of the Earth's orientation goes from {begin} to {end}; beyond it UT1 is guessed, and the sky may be turned"
-        f" by {off:.0f} arcsec; a newer astropy-iers-data has later dates"
+        f"the table of the Earth's orientation goes from {begin} to {end}; beyond it UT1 is"
+        f" guessed, and the sky may be turned by {off:.0f} arcsec; a newer astropy-iers-data has"
+        " later dates"
     )
 
 
@@ -226,7 +231,8 @@ def q_icrs_to_date(
     else:
         raise AemFaultError(
             "",
-            f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI, TT, TDB or GPS",
+            f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI,"
+            " TT, TDB or GPS",
         )
     turning = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
     return q_icrs_to_itrs(utc_ns), turning, beyond_table(int(utc_ns.min()), int(utc_ns.max()))
@@ -303,13 +309,14 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
         for option, value in (("--place", stated.place), ("--epoch-utc", stated.epoch_utc)):
             if value is not None:
                 raise InputError(
-                    f"{path}: {option} is for attitudes that refer to a level frame (--reference enu or ned), and these refer"
-                    f" to {AXES[kind]}; leave it out"
+                    f"{path}: {option} is for attitudes that refer to a level frame (--reference"
+                    f" enu or ned), and these refer to {AXES[kind]}; leave it out"
                 )
         return Reference(kind)
     if stated.place is None:
         raise InputError(
-            f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT"
+            f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place"
+            " LAT,LON,HEIGHT"
         )
     dated, utc_ns = first_ns >= FIRST_DATE_NS, 0
     if dated and stated.epoch_utc is not None:
@@ -319,7 +326,8 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
     if not dated:
         if stated.epoch_utc is None:
             raise InputError(
-                f"{path}: its times begin at {first_ns / NS_PER_S:.9g} s, no date; give --epoch-utc TIME, UTC at 0 s"
+                f"{path}: its times begin at {first_ns / NS_PER_S:.9g} s, no date; give --epoch-utc"
+                " TIME, UTC at 0 s"
             )
         utc_ns = utc_ns_of(stated.epoch_utc, "--epoch-utc")
     return Reference(kind, stated.place[:2], utc_ns)
@@ -336,7 +344,8 @@ def reference_kind(path: Path, stated: Stated, told: list[tuple[str, str]]) -> K
     kind = KINDS.get(stated.reference.lower())
     if kind is None:
         raise InputError(
-            f"{path}: --reference {shortened(stated.reference)}: the log names no frame; write icrs, enu or ned"
+            f"{path}: --reference {shortened(stated.reference)}: the log names no frame; write"
+            " icrs, enu or ned"
         )
     if stated.reference.lower() in LOOSE:
         told.append(("reference", loosely_icrs(stated.reference)))

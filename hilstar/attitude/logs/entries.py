@@ -180,7 +180,10 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
         told.append(
             (
                 "log-order",
-                f"{late} attitudes came out of order, by up to {latest_ns / NS_PER_S:.3g} s, and are sorted",
+                (
+                    f"{late} attitudes came out of order, by up to {latest_ns / NS_PER_S:.3g} s,"
+                    " and are sorted"
+                ),
             )
         )
     if repeats:
@@ -228,7 +231,10 @@ class LogJoins:
         lines = []
         if self.held_ns:
             gaps = "1 gap" if len(self.held_ns) == 1 else f"{len(self.held_ns)} gaps"
-            sizes = f"the longest {self.longest_s:.6g} s (over {GAP_INTERVALS} times its usual {self.usual_s:.6g} s)"
+            sizes = (
+                f"the longest {self.longest_s:.6g} s (over {GAP_INTERVALS} times its usual"
+                f" {self.usual_s:.6g} s)"
+            )
             lines.append(("log-gap", f"the log has {gaps}, {sizes}; the attitude is held there"))
         if self.misfits:
             misfits = f"in {self.misfits} intervals the log's rates do not fit its attitudes"

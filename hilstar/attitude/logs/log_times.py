@@ -56,7 +56,10 @@ def span_line(samples: Sequence[AttitudeSample]) -> str:
     span_s = (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S
     if len(samples) < 2:
         return "the log is a single attitude"
-    return f"the log is {span_s:.6g} s long: {len(samples)} attitudes, a step of {median_step_s(samples):.4g} s (median)"
+    return (
+        f"the log is {span_s:.6g} s long: {len(samples)} attitudes, a step of"
+        f" {median_step_s(samples):.4g} s (median)"
+    )
 
 
 def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str, str]]:
@@ -77,7 +80,10 @@ def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str
     return [
         (
             TIMES,
-            f"{span_line(samples)}, which is {limit}: are its times in {unit}, as the format has them?",
+            (
+                f"{span_line(samples)}, which is {limit}: are its times in {unit}, as the format"
+                " has them?"
+            ),
         )
     ]
 

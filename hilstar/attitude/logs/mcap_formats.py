@@ -53,7 +53,8 @@ def _refuse_other_topics(path: Path) -> None:
         named = [topic[:MAX_QUOTED_CHARACTERS] for topic in topics[:MAX_NAMED_TOPICS]]
         names = ", ".join([*named, *(["..."] if len(topics) > MAX_NAMED_TOPICS else [])])
         raise InputError(
-            f"{path}: contains no attitude; its topics are {names}, and only {ATTITUDE_TOPIC} is read"
+            f"{path}: contains no attitude; its topics are {names}, and only {ATTITUDE_TOPIC} is"
+            " read"
         )
 
 

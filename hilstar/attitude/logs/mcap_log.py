@@ -392,7 +392,8 @@ def unpacked(
         whole = data
     if len(whole) > limit or (exact and len(whole) != limit):
         raise DamageError(
-            f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes that it states"
+            f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes"
+            " that it states"
         )
     return whole
 

@@ -85,11 +85,17 @@ IntArray = npt.NDArray[np.int64]
 MAX_EDGES = 10_000
 MAX_NAMED = 8
 FORM = "icrs, enu or ned"
-STATE = "state its axes with --reference icrs, or with --reference enu or ned and --place LAT,LON,HEIGHT"
+STATE = (
+    "state its axes with --reference icrs, or with --reference enu or ned and --place"
+    " LAT,LON,HEIGHT"
+)
 MAX_NAMED_TOPICS = 12
 STATIC_TF = "tf_static"
 OPTICAL = ("_optical_frame", "_optical")
-ORDER_ADVICE = "the bag has two attitudes of one time, or its clock was set back; choose one sender, or cut the bag there"
+ORDER_ADVICE = (
+    "the bag has two attitudes of one time, or its clock was set back; choose one sender, or cut"
+    " the bag there"
+)
 
 
 class _RosTurn(NamedTuple):
@@ -230,7 +236,10 @@ class _FrameChain(NamedTuple):
             told.append(
                 (
                     "log-tf",
-                    f"{int((~known).sum())} attitudes at times that not all of these transforms have are left out",
+                    (
+                        f"{int((~known).sum())} attitudes at times that not all of these transforms"
+                        " have are left out"
+                    ),
                 )
             )
         received_ns, stamps_ns = (
@@ -256,7 +265,8 @@ class _Tree:
                 count += 1
                 if count > MAX_EDGES:
                     raise InputError(
-                        f"{path}: tf has more than {MAX_EDGES} transforms; record those that are wanted"
+                        f"{path}: tf has more than {MAX_EDGES} transforms; record those that are"
+                        " wanted"
                     )
             parents[reference].add(turn, received_ns)
 
@@ -273,7 +283,8 @@ class _Tree:
             moving = [edge for edge in self._all() if edge.moves] or self._all()
             if len(moving) != 1:
                 raise InputError(
-                    f"{self._path}: several transforms of tf could be meant: {_edge_names(moving)}; choose with --body FRAME"
+                    f"{self._path}: several transforms of tf could be meant: {_edge_names(moving)};"
+                    " choose with --body FRAME"
                 )
             body = moving[0].child
         edges = self._edges(body, reference)
@@ -283,7 +294,8 @@ class _Tree:
                 worst = float(np.abs(np.linalg.norm(edge.q, axis=1) - 1).max())
             if edge is not timed and not worst <= NORM_TOLERANCE:
                 raise InputError(
-                    f"{self._path}: the transform {_edge_names([edge])} has a quaternion whose norm is off by {worst:.3g}"
+                    f"{self._path}: the transform {_edge_names([edge])} has a quaternion whose norm"
+                    f" is off by {worst:.3g}"
                 )
         return _FrameChain(body, edges[-1].parent, edges, timed)
 
@@ -294,7 +306,8 @@ class _Tree:
             parents = list(self._up[frame].values())
             if len(parents) > 1:
                 raise InputError(
-                    f"{self._path}: in tf, {frame!r} has several parents: {_edge_names(parents)}; record one of them"
+                    f"{self._path}: in tf, {frame!r} has several parents: {_edge_names(parents)};"
+                    " record one of them"
                 )
             found.append(parents[0])
             frame = parents[0].parent
@@ -333,7 +346,8 @@ def named(reference: str | None) -> tuple[str | None, Kind | None]:
     kind = KINDS.get(meaning.lower())
     if equals and kind is None:
         raise InputError(
-            f"--reference {reference}: the axes of {frame} are {FORM}; write --reference {frame}=icrs, for example"
+            f"--reference {reference}: the axes of {frame} are {FORM}; write --reference"
+            f" {frame}=icrs, for example"
         )
     return (reference, None) if kind is None else (frame or None, kind)
 
@@ -382,7 +396,8 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     if not bag.has_own_fields(topic):
         where = f"{bag.path}: {topic.name}"
         raise InputError(
-            f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it"
+            f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS"
+            " defines it"
         )
     told: list[tuple[str, str]] = []
     every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
@@ -391,7 +406,10 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
         told.append(
             (
                 "log-stamp",
-                f"the messages of {topic.name} have no time of their own; when they were recorded is taken",
+                (
+                    f"the messages of {topic.name} have no time of their own; when they were"
+                    " recorded is taken"
+                ),
             )
         )
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
@@ -407,7 +425,10 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
         told.append(
             (
                 "mounting",
-                f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same",
+                (
+                    f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam"
+                    " all the same"
+                ),
             )
         )
     return LogReading(
@@ -447,7 +468,8 @@ def _begin(
     begin = list(islice(heard, 2))
     if not begin and not unset:
         raise InputError(
-            f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has"
+            f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what"
+            " it has"
         )
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
     stamped = any(each.turn.stamp_ns for each in begin)
@@ -467,7 +489,8 @@ def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
         if found not in readable:
             types = ", ".join(sorted({kind.rpartition("/")[2] for kind in TYPES}))
             raise InputError(
-                f"{bag.path}: {found.name} is of {found.type}, which says no attitude; read are {types}"
+                f"{bag.path}: {found.name} is of {found.type}, which says no attitude; read are"
+                f" {types}"
             )
         return found
     choice = [topic for topic in readable if not topic.name.endswith(STATIC_TF)] or readable
@@ -475,7 +498,8 @@ def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
         raise InputError(f"{bag.path}: has no topic with attitudes; it has {_topic_names(topics)}")
     if len(choice) > 1:
         raise InputError(
-            f"{bag.path}: has several topics with attitudes: {_topic_names(choice)}; choose one with --topic NAME"
+            f"{bag.path}: has several topics with attitudes: {_topic_names(choice)}; choose one"
+            " with --topic NAME"
         )
     return choice[0]
 

@@ -20,7 +20,10 @@ from hilstar.basics.text_tables import finite_numbers, is_valid, read_rows
 from hilstar.basics.units import NS_PER_S
 
 COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
-ADVICE = f"write a CSV with the columns {','.join(COLUMNS)} and, where known, valid (1 or 0); or give an AEM or an MCAP file"
+ADVICE = (
+    f"write a CSV with the columns {','.join(COLUMNS)} and, where known, valid (1 or 0); or give an"
+    " AEM or an MCAP file"
+)
 MAX_BYTES = 500_000_000
 MAX_ROWS = 3_000_000
 MAX_T_NS = 9 * 10**18
@@ -72,7 +75,8 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
         if rising and len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
             raise InputError(
-                f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording"
+                f"{path}:{number}: time does not increase ({said}); sort the rows, and give one"
+                " recording"
             )
         valid.append(is_valid(path, number, cells[5]))
         own = [math.nan] * 4
@@ -104,6 +108,7 @@ def _time(path: Path, line: int, cell: str) -> int:
         t_ns = None
     if t_ns is None or abs(t_ns) > MAX_T_NS:
         raise InputError(
-            f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that runs evenly"
+            f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that"
+            " runs evenly"
         )
     return t_ns

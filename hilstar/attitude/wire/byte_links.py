@@ -184,7 +184,10 @@ class UdpBytes(ByteLink):
                 found.append(datagram)
                 continue
             self.link_counts.rejected += 1
-            said = f"datagrams from {host} are dropped: it is not in [answers] allow; further ones are only counted"
+            said = (
+                f"datagrams from {host} are dropped: it is not in [answers] allow; further ones are"
+                " only counted"
+            )
             self._notices.begin("sender-not-allowed", said)
         return found
 
@@ -225,7 +228,10 @@ class TcpBytes(ByteLink):
                 family = socket.AF_INET6 if place.host.version == 6 else socket.AF_INET
                 self._listener = socket.create_server((host, port), family=family)
             except OSError as error:
-                said = f"cannot listen ({error.strerror}); write an address of this machine and a free port"
+                said = (
+                    f"cannot listen ({error.strerror}); write an address of this machine and a free"
+                    " port"
+                )
                 raise InputError(f"[answers] listen: {self.endpoint}: {said}") from error
             self._listener.setblocking(False)
 
@@ -295,7 +301,10 @@ class TcpBytes(ByteLink):
             return
         if self._connection is not None and not self._holds.over:
             self.link_counts.rejected += 1
-            self._refused = f"a second connection, from {peer}, is refused: {self._peer} holds the line and sends"
+            self._refused = (
+                f"a second connection, from {peer}, is refused: {self._peer} holds the line and"
+                " sends"
+            )
             self._told = self._clock.within(TOLD_S)
             self._notices.tell("second-connection", f"{self.endpoint}: {self._refused}")
             made.close()

@@ -79,7 +79,8 @@ def parse_endpoint(text: str) -> Endpoint:
             or len(os.fsencode(name)) > MAX_PATH_BYTES
         ):
             raise InputError(
-                f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}"
+                f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes;"
+                f" {PATH_FORM}"
             )
         return Endpoint(text, loopback=True, path=Path(name))
     match = TCP.fullmatch(text)
@@ -103,7 +104,8 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
     except ValueError as error:
         if bracketed or len(host) > MAX_HOST_CHARACTERS or not HOST_NAME.fullmatch(host):
             raise InputError(
-                f"{shortened(text)}: {shortened(host)} is neither an address nor a host name; {ENDPOINT_FORM}"
+                f"{shortened(text)}: {shortened(host)} is neither an address nor a host name;"
+                f" {ENDPOINT_FORM}"
             ) from error
         return host, False, False
     mapped = getattr(address, "ipv4_mapped", None)
@@ -144,7 +146,8 @@ def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
         )
     if mode is not None and not stat.S_ISSOCK(mode):
         raise InputError(
-            f"{text}: an existing file that is not a socket, and binding would delete it; write another path"
+            f"{text}: an existing file that is not a socket, and binding would delete it; write"
+            " another path"
         )
     if mode is not None and bind and _is_served(path):
         raise InputError(
@@ -233,7 +236,8 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
         word = f'endpoint = "{shortened(endpoint)}"'
         if not endpoint.startswith("udp://"):
             raise InputError(
-                f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or {BIND_FORM.removeprefix('write ')}"
+                f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or"
+                f" {BIND_FORM.removeprefix('write ')}"
             )
         said[word] = _parts(endpoint.removeprefix("udp://"), word)
     hosts = {word: host for word, (host, _) in said.items() if host is not None} or {

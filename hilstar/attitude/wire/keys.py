@@ -53,7 +53,8 @@ def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -
     if not keys.given:
         if not endpoint.loopback:
             raise InputError(
-                f"{text}: non-loopback endpoints require CURVE keys; {MAKE_KEYS}, or use tcp://127.0.0.1:PORT"
+                f"{text}: non-loopback endpoints require CURVE keys; {MAKE_KEYS}, or use"
+                " tcp://127.0.0.1:PORT"
             )
         return
     if keys.secret_key is None:
@@ -62,11 +63,13 @@ def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -
         )
     if bind and keys.allowed_clients is None:
         raise InputError(
-            f"{text}: the side that binds requires allowed_clients, a directory of public keys; {MAKE_KEYS}"
+            f"{text}: the side that binds requires allowed_clients, a directory of public keys;"
+            f" {MAKE_KEYS}"
         )
     if not bind and keys.server_key is None:
         raise InputError(
-            f"{text}: the side that connects requires curve_server_key, the other side's public key; {MAKE_KEYS}"
+            f"{text}: the side that connects requires curve_server_key, the other side's public"
+            f" key; {MAKE_KEYS}"
         )
 
 
@@ -161,7 +164,8 @@ class AllowList:
         self._seen = self._look()
         if not self._seen:
             raise InputError(
-                f"{directory}: allowed_clients contains no *.key file; put each client's public key there"
+                f"{directory}: allowed_clients contains no *.key file; put each client's public key"
+                " there"
             )
         self._keys = {load_public(path) for path in self._seen}
 

@@ -62,8 +62,9 @@ def written(q_icrs_to_body: FloatArray) -> str:
 
 CONVENTIONS = Conventions(
     "NASA's 42",
-    "SC[i].B[0].qn is the attitude of body 0 in N, wn its rate in body components; N is taken as the ICRS, which holds (within"
-    " 23 mas) where the reference orbit is about the Earth: about any other world 42's N is that world's own equator",
+    "SC[i].B[0].qn is the attitude of body 0 in N, wn its rate in body components; N is taken as"
+    " the ICRS, which holds (within 23 mas) where the reference orbit is about the Earth: about any"
+    " other world 42's N is that world's own equator",
     "scalar last (x, y, z, w); as a Hamilton quaternion it turns body components into those of N",
     "UTC, every day of 86400 s, from 1970-01-01",
     of_body=True,
@@ -76,7 +77,8 @@ def spacecraft_number(name: str | int | None) -> int:
     match = SPACECRAFT.fullmatch(str(0 if name is None else name))
     if match is None:
         raise InputError(
-            f'spacecraft = "{shortened(name)}": write 42\'s number of it, such as spacecraft = "SC[0]"'
+            f'spacecraft = "{shortened(name)}": write 42\'s number of it, such as spacecraft ='
+            ' "SC[0]"'
         )
     return int(match[1])
 

@@ -332,8 +332,9 @@ def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | Non
         return None
     return Refusal(
         "rate",
-        f"a rate of {rate_rad_s:.4g} rad/s ({math.degrees(rate_rad_s):.4g} deg/s) exceeds [attitude] max_rate_deg_s ="
-        f" {math.degrees(max_rate_rad_s):g}; send rates in rad/s, or write a larger max_rate_deg_s",
+        f"a rate of {rate_rad_s:.4g} rad/s ({math.degrees(rate_rad_s):.4g} deg/s) exceeds"
+        f" [attitude] max_rate_deg_s = {math.degrees(max_rate_rad_s):g}; send rates in rad/s, or"
+        " write a larger max_rate_deg_s",
     )
 
 

@@ -65,9 +65,11 @@ def adapters() -> list[str]:
     """
     ports = sorted(list_ports.comports())
     words = [
-        f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
-        if port.vid is not None
-        else "UART"
+        (
+            f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
+            if port.vid is not None
+            else "UART"
+        )
         for port in ports
     ]
     return [
@@ -346,7 +348,10 @@ def _opening_fault(error: BaseException, port: str) -> str:
     elif isinstance(error, ValueError):
         instead = "write a baud rate that the port supports, such as 115200 or 921600"
     else:
-        instead = f"write the serial port, such as /dev/ttyUSB0 (ls /dev/serial/by-id lists them), not {port!r}"
+        instead = (
+            "write the serial port, such as /dev/ttyUSB0 (ls /dev/serial/by-id lists them), not"
+            f" {port!r}"
+        )
     return f"{' '.join(str(getattr(error, 'strerror', None) or error).split())}; {instead}"
 
 
@@ -399,7 +404,10 @@ class RtsLine:
             if self._device is None:
                 raise opening_refusal(f"[sync] port = {port}", error, port) from error
             self.close()
-            fault = f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"
+            fault = (
+                f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines,"
+                " such as /dev/ttyUSB0"
+            )
             raise InputError(f"[sync] port = {port}: {fault}") from error
 
     @property

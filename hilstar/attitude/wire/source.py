@@ -33,8 +33,8 @@ UNSTATED = (
     "write [tracker] q_body_to_cam (without a bench file: --mounting W,X,Y,Z)"
 )
 UNUSED = (
-    "[tracker] q_body_to_cam does not turn these attitudes: they are taken as the camera's; if they are the body's, write "
-    '[attitude] convention = { frame = "body" }'
+    "[tracker] q_body_to_cam does not turn these attitudes: they are taken as the camera's; if they"
+    ' are the body\'s, write [attitude] convention = { frame = "body" }'
 )
 
 
@@ -83,7 +83,10 @@ class Convention(Table, frozen=True):
 
     def __str__(self) -> str:
         """As a bench file has it."""
-        return f'{{ scalar = "{self.scalar}", direction = "{self.direction}", frame = "{self.frame}" }}'
+        return (
+            f'{{ scalar = "{self.scalar}", direction = "{self.direction}", frame ='
+            f' "{self.frame}" }}'
+        )
 
 
 HILSTARS = Convention()
@@ -174,11 +177,15 @@ class Conventions:
         q = from_radec_roll_deg(*CHECK_RADEC_DEG, 0.0)
         own = mounting.q_icrs_to_body(q) if self.of_body else q
         ra_deg, dec_deg = CHECK_RADEC_DEG
-        mounted = f"it is the body's; [tracker] q_body_to_cam = {components(mounting.q_body_to_cam)} makes it the camera's"
+        mounted = (
+            f"it is the body's; [tracker] q_body_to_cam = {components(mounting.q_body_to_cam)}"
+            " makes it the camera's"
+        )
         seen = f"{CHECK_STAR} (RA {ra_deg:g}, Dec {dec_deg:g}) is in the middle, north up"
+        meaning = mounted if self.of_body else "it is the camera itself; q_body_to_cam is not used"
         return [
             f"{self.source}: {self.turns}; {self.scalar}",
-            f"attitude: {mounted if self.of_body else 'it is the camera itself; q_body_to_cam is not used'}",
+            f"attitude: {meaning}",
             f"time: {self.time}",
             f"self-check: at {self.written(own)} {seen}; yours should be too",
         ]

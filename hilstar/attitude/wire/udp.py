@@ -64,7 +64,9 @@ MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROP
 
 TROUBLE = {
     errno.EADDRINUSE: "the port is in use; stop the program that has it, or choose another port",
-    errno.EADDRNOTAVAIL: "not an address of this machine; write one that `ip addr` lists, or 0.0.0.0 for all",
+    errno.EADDRNOTAVAIL: (
+        "not an address of this machine; write one that `ip addr` lists, or 0.0.0.0 for all"
+    ),
     errno.EACCES: "not permitted; write a port from 1024 to 65535",
 }
 SocketAddress = tuple[Any, ...]
@@ -311,7 +313,10 @@ class UdpLink(StreamLink):
                 waiting.append(datagram)
                 continue
             self.link_counts.rejected += 1
-            said = f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones are only counted"
+            said = (
+                f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones"
+                " are only counted"
+            )
             self._notices.begin("sender-not-allowed", said)
         self._look(len(taken) - len(waiting))
         admitted = self._gate.newest(waiting, declares_discontinuity)
@@ -333,7 +338,10 @@ class UdpLink(StreamLink):
         if self._strangers > MAX_STRANGERS and not self._filtered:
             self._filtered = True
             if self._datagrams.keep_only(self._allowed.networks):
-                said = f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed: the kernel drops them now"
+                said = (
+                    f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed:"
+                    " the kernel drops them now"
+                )
                 self._notices.tell("flood", said)
         if now_ns - self._looked_ns > LOOK_NS:
             self._looked_ns, self._strangers = now_ns, 0

@@ -81,8 +81,8 @@ def check_loopback(endpoint: str) -> None:
     port = place.address.rpartition(":")[2]
     forward = f"ssh -L {port}:127.0.0.1:{port} HOST"
     raise InputError(
-        f"{endpoint}: not an address of this machine alone, and Basilisk knows no keys; forward its port ({forward}) and"
-        f" write tcp://127.0.0.1:{port}"
+        f"{endpoint}: not an address of this machine alone, and Basilisk knows no keys; forward its"
+        f" port ({forward}) and write tcp://127.0.0.1:{port}"
     )
 
 
@@ -103,9 +103,15 @@ def _written(q: FloatArray) -> str:
     return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in sigma)})"
 
 
-TURNS = "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components"
+TURNS = (
+    "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body"
+    " components"
+)
 VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
-PLACE = "its place and velocity about the Earth (at N's origin, where the message has none) are those of the observer"
+PLACE = (
+    "its place and velocity about the Earth (at N's origin, where the message has none) are those"
+    " of the observer"
+)
 # what is used of a message, besides the attitude
 StateUse = Literal["attitude", "velocity", "state"]
 TOLD: dict[StateUse, tuple[str, ...]] = {"attitude": (), "velocity": (VELOCITY,), "state": (PLACE,)}
@@ -189,7 +195,10 @@ class Follower:
         if isinstance(chosen, wire.Refusal):
             return chosen, update
         if len(chosen.sigma_bn) != 3:
-            what = f"spacecraft {named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
+            what = (
+                f"spacecraft {named(chosen)}: {len(chosen.sigma_bn)} components of its rotation"
+                " (sigma_BN), not 3"
+            )
             return wire.Refusal("format", what), update
         sample = wire.checked_sample(
             update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % wire.U32
@@ -222,7 +231,10 @@ class Follower:
         speed_m_s, far_km = math.hypot(*velocity_m_s), math.hypot(*place_m) / M_PER_KM
         if len(velocity_m_s) != 3 or not speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
             told = f"{speed_m_s:.3g} m/s" if velocity_m_s else "nothing"
-            advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
+            advice = (
+                f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves"
+                " it out"
+            )
             return wire.Refusal(
                 "format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}"
             )
@@ -286,7 +298,8 @@ def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
         if turn_arcsec > MAX_TURN_ARCSEC:
             q = ", ".join(f"{c:.7f}" for c in mounted)
             differences.append(
-                f"its sigma_CB is q_body_to_cam = ({q}), {turn_arcsec / 3600:.4g} deg from the bench's"
+                f"its sigma_CB is q_body_to_cam = ({q}), {turn_arcsec / 3600:.4g} deg from the"
+                " bench's"
             )
     if camera.resolution_px and camera.resolution_px != tracker.resolution_px:
         differences.append(
@@ -301,7 +314,10 @@ def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
         )
     if not differences:
         return None
-    return f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets: {'; '.join(differences)}"
+    return (
+        f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets:"
+        f" {'; '.join(differences)}"
+    )
 
 
 def named(craft: VizBody) -> str:

@@ -45,14 +45,20 @@ def peer_trouble(address: str, answer: bytes | None, kind: str, keys: bool) -> s
         silent = "something takes the connection there and says nothing, so it is no ZeroMQ"
         return f"{address}: {silent}; give the place of a {wanted} socket"
     if answer[:1] != SIGNATURE[:1] or len(answer) < GREETING_BYTES:
-        return f"{address}: no ZeroMQ answers there, but {likeness(answer).what}; give the place of a {wanted} socket"
+        return (
+            f"{address}: no ZeroMQ answers there, but {likeness(answer).what}; give the place of a"
+            f" {wanted} socket"
+        )
     mechanism = answer[MECHANISM].rstrip(b"\0").decode(errors="replace")
     if keys or mechanism != "NULL":
         return _keys_trouble(address, mechanism, keys)
     told = SOCKET_TYPE.search(answer, GREETING_BYTES)
     if told is None or told[2].decode() in PARTNERS[kind]:
         return ""
-    return f"{address}: a {told[2].decode()} socket is there, and ours is {kind}; let the other side open a {wanted} socket"
+    return (
+        f"{address}: a {told[2].decode()} socket is there, and ours is {kind}; let the other side"
+        f" open a {wanted} socket"
+    )
 
 
 def _keys_trouble(address: str, mechanism: str, keys: bool) -> str:
@@ -60,10 +66,19 @@ def _keys_trouble(address: str, mechanism: str, keys: bool) -> str:
     if mechanism not in {"NULL", "CURVE"}:
         return f"{address}: it asks for {mechanism}; hilstar has CURVE keys, or none"
     if not keys:
-        return f"{address}: it asks for keys (CURVE), and we have none; give {KEYS} (hilstar keys makes them)"
+        return (
+            f"{address}: it asks for keys (CURVE), and we have none; give {KEYS} (hilstar keys"
+            " makes them)"
+        )
     if mechanism == "NULL":
-        return f"{address}: it has no keys, and we have; give it keys (hilstar keys), or leave {KEYS} out"
-    return "the other side rejected us: check its allowed_clients, and our curve_server_key, and that it is no other socket type"
+        return (
+            f"{address}: it has no keys, and we have; give it keys (hilstar keys), or leave"
+            f" {KEYS} out"
+        )
+    return (
+        "the other side rejected us: check its allowed_clients, and our curve_server_key, and that"
+        " it is no other socket type"
+    )
 
 
 def answer_of(address: str, patience_s: float = PATIENCE_S) -> bytes | None:

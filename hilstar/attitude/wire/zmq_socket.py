@@ -452,7 +452,8 @@ class ZmqSocket(Link):
             self._keeper.tend()
         if self._memory.grown_bytes() > MAX_GROWTH_BYTES:
             self._reset(
-                f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that never ends"
+                f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that"
+                " never ends"
             )
 
     def _take(self) -> bytes | None:
@@ -517,7 +518,10 @@ def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:
             f"{endpoint}: the port is in use; stop the program that has it, or choose another port"
         )
     if bind and error.errno in {errno.ENODEV, zmq.EADDRNOTAVAIL}:
-        return f"{endpoint}: not an address of this machine, so it cannot be bound; connect (--connect, bind = false) instead"
+        return (
+            f"{endpoint}: not an address of this machine, so it cannot be bound; connect"
+            " (--connect, bind = false) instead"
+        )
     verb = "bind" if bind else "connect"
     form = PATH_FORM if endpoint.startswith("ipc:") else ENDPOINT_FORM
     return f"{endpoint}: cannot {verb} ({zmq.strerror(error.errno or 0)}); {form}"

@@ -215,7 +215,10 @@ def raise_priority() -> str:
             0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(FIFO_PRIORITY)
         )
     except (OSError, AttributeError) as error:
-        return f"normal: SCHED_FIFO is not allowed ({getattr(error, 'strerror', error)}); give this user rtprio in limits.conf"
+        return (
+            f"normal: SCHED_FIFO is not allowed ({getattr(error, 'strerror', error)}); give this"
+            " user rtprio in limits.conf"
+        )
     return f"SCHED_FIFO {FIFO_PRIORITY}"
 
 

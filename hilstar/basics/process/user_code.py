@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any
 
 PREFIX = "python:"
-ADVICE = 'put it there, or write [answers] trust = ["{package}"] if it is an installed package that you trust'
+ADVICE = (
+    'put it there, or write [answers] trust = ["{package}"] if it is an installed package that you'
+    " trust"
+)
 _folders: dict[str, str] = {}  # of the modules that were loaded here
 
 
@@ -65,7 +68,8 @@ def _check_place(package: str, folder: str) -> None:
     )
     if own:
         raise UserCodeError(
-            f"{package} is the name of a module of Python or of hilstar; give {folder}/{package} another"
+            f"{package} is the name of a module of Python or of hilstar; give {folder}/{package}"
+            " another"
         )
     _folders[package] = folder
     sys.path.insert(0, folder)

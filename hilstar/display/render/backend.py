@@ -152,7 +152,8 @@ class Target:
         if self.uniformity is not None and self.uniformity.shape != (height, width):
             found = " x ".join(map(str, self.uniformity.shape[::-1]))
             raise InputError(
-                f"the uniformity map is {found} px and the monitor {width} x {height}; give one value per pixel"
+                f"the uniformity map is {found} px and the monitor {width} x {height}; give one"
+                " value per pixel"
             )
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 

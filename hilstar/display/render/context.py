@@ -121,13 +121,19 @@ def described() -> str:
     ctx = create_context()
     try:
         info = ctx.info
-        what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+        what = (
+            f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to"
+            f" {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+        )
         exact = (
             "compute shaders"
             if ctx.version_code >= COMPUTE_VERSION
             else "NumPy (slow: their shaders need OpenGL 4.3)"
         )
-        return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
+        return (
+            f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'},"
+            f" exact and temporal by {exact}"
+        )
     finally:
         ctx.release()
 

@@ -103,7 +103,8 @@ class Driver:
         if result == GL_TIMEOUT_EXPIRED:
             self.check()
             raise GpuError(
-                f"the GPU has not finished a frame for {MAX_SLICES * SLICE_NS // NS_PER_S} s; see dmesg"
+                f"the GPU has not finished a frame for {MAX_SLICES * SLICE_NS // NS_PER_S} s; see"
+                " dmesg"
             )
         if result == GL_WAIT_FAILED:
             self.check()

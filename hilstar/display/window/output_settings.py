@@ -114,7 +114,10 @@ def findings(
         and abs(found[0] - pixel_pitch_um) > PITCH_TOLERANCE * found[0] + found[1]
     ):
         told = f"{state.name} says by its EDID that its pixels are {found[0]:.1f} um apart"
-        text = f"{told} and the bench file says {pixel_pitch_um:g}; measure it, and set [monitor] pixel_pitch_um"
+        text = (
+            f"{told} and the bench file says {pixel_pitch_um:g}; measure it, and set [monitor]"
+            " pixel_pitch_um"
+        )
         yield Finding(text, False)
 
 
@@ -123,22 +126,32 @@ def _geometry_findings(state: OutputState) -> Iterator[Finding]:
     if off > TRANSFORM_TOLERANCE:
         mend = f"xrandr --output {state.name} --transform none"
         yield Finding(
-            f"{state.name} has a transform (fractional scaling), which resamples every frame; {mend}",
+            f"{state.name} has a transform (fractional scaling), which resamples every frame;"
+            f" {mend}",
             True,
         )
     if state.preferred_px and state.mode_px not in state.preferred_px:
         width, height = state.mode_px
         wide, high = state.preferred_px[0]
-        mode = f"{state.name} runs at {width} x {height} and its own pixels are {wide} x {high}: it scales every frame"
+        mode = (
+            f"{state.name} runs at {width} x {height} and its own pixels are {wide} x {high}: it"
+            " scales every frame"
+        )
         scaling = (state.properties or {}).get("scaling mode")
         mode += "" if scaling is None else f" (scaling mode {_words(scaling)})"
         yield Finding(f"{mode}; xrandr --output {state.name} --mode {wide}x{high}", True)
     if state.rotated:
-        mend = f"xrandr --output {state.name} --rotate normal --reflect normal, and [monitor] rotate_deg, flip_x, flip_y"
+        mend = (
+            f"xrandr --output {state.name} --rotate normal --reflect normal, and [monitor]"
+            " rotate_deg, flip_x, flip_y"
+        )
         yield Finding(f"X rotates or reflects {state.name}, by a copy of each frame; {mend}", False)
     if len(state.providers) > 1:
         gpus = f"the X screen has {len(state.providers)} GPUs ({', '.join(state.providers)})"
-        mend = "plug the monitor into the GPU that draws, or draw by its own (xrandr --listproviders; DRI_PRIME=0)"
+        mend = (
+            "plug the monitor into the GPU that draws, or draw by its own (xrandr --listproviders;"
+            " DRI_PRIME=0)"
+        )
         yield Finding(
             f"{gpus}: frames may be copied from one to the other, a refresh late; {mend}", False
         )

@@ -39,12 +39,12 @@ USUAL_REFRESH_HZ = 60
 GL_RENDERER = 0x1F01
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
 DEAD_DISPLAY = (
-    "no X server answers there, or it does not let us in (XAUTHORITY); start it, set DISPLAY to one that runs, or run with "
-    "--headless"
+    "no X server answers there, or it does not let us in (XAUTHORITY); start it, set DISPLAY to one"
+    " that runs, or run with --headless"
 )
 WAYLAND = (
-    "no X11 display: this session is Wayland's, where a program can neither time its frames nor set the gamma ramp; "
-    "use an Xorg session, or run with --headless"
+    "no X11 display: this session is Wayland's, where a program can neither time its frames nor set"
+    " the gamma ramp; use an Xorg session, or run with --headless"
 )
 log = logging.getLogger(__name__)
 
@@ -76,7 +76,10 @@ class Display:
         """The display for a person."""
         width, height = self.resolution_px
         refresh = f"{self.refresh_hz} Hz" if self.refresh_hz else "refresh not known"
-        return f"{self.index}: {self.name}, {width} x {height}, {refresh}, {self.size_mm[0]} x {self.size_mm[1]} mm"
+        return (
+            f"{self.index}: {self.name}, {width} x {height}, {refresh}, {self.size_mm[0]} x"
+            f" {self.size_mm[1]} mm"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +219,8 @@ class Window(Closing):
             self._window = _newest_window(width, height, monitor)
         if not self._window:
             raise MachineError(
-                "no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri"
+                "no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1"
+                " libgl1-mesa-dri"
             )
         if self.display is not None:  # as it is now
             self.display = _describe(self.display.index, monitor)
@@ -299,7 +303,8 @@ class Window(Closing):
         if monitor is None and not self.lost:
             self.lost, self._ramp = True, None
             log.warning(
-                "the display %s is gone; frames go on, and the window returns to it when it is back",
+                "the display %s is gone; frames go on, and the window returns to it when it is"
+                " back",
                 display.name,
             )
         elif monitor is not None and (self.lost or not on_it):

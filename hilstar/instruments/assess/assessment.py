@@ -159,7 +159,10 @@ SMALL = 0.3  # share of the noise above which the display's own error gets a not
 BENT_ARCSEC = 0.1
 # noise that lasts for so many answers gets a note from this share of the variance on
 TOGETHER, SLOW_SHARE = 20, 0.1
-CLOCK_SET = "the tracker's clock was set during the run: its answers are placed by their arrivals, not by their stamps"
+CLOCK_SET = (
+    "the tracker's clock was set during the run: its answers are placed by their arrivals, not by"
+    " their stamps"
+)
 # answers whose median shift against their arrivals is compared with the next ones'
 SET_BLOCK, MAX_CLOCK_DRIFT = 11, 2e-3
 
@@ -220,12 +223,14 @@ def read_ledger(path: Path) -> RunLedger:
             else "none of them has an attitude"
         )
         raise InputError(
-            f"{path}: {len(shown)} frames, and {why}; give the ledger of a run that was sent attitudes"
+            f"{path}: {len(shown)} frames, and {why}; give the ledger of a run that was sent"
+            " attitudes"
         )
     config = config_of(head)
     if config is None:
         raise InputError(
-            f"{path}: its head holds no bench file that can be read; give the ledger of serve or replay --ledger"
+            f"{path}: its head holds no bench file that can be read; give the ledger of serve or"
+            " replay --ledger"
         )
     # A moment stands for an exposure about it; a refresh period more, for it is known to some
     # milliseconds.
@@ -293,7 +298,10 @@ class Assessment:
             else ""
         )
         touched = f"{len(self.found.held)} answers looked while a frame was held for them"
-        return f"{missed} ({share:.2g} % of refresh periods{where}); {touched}, and are in no figure but the availability"
+        return (
+            f"{missed} ({share:.2g} % of refresh periods{where}); {touched}, and are in no figure"
+            " but the availability"
+        )
 
 
 class LedgerAnswers(NamedTuple):
@@ -325,7 +333,8 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
             else "no answers of a tracker"
         )
         raise InputError(
-            f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with [answers]"
+            f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with"
+            " [answers]"
         )
     on_run_ns = _on_run_ns(records)
     stamped = stamp != "arrival" and all(record.t_ns is not None for record in records)
@@ -411,7 +420,8 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
         raise InputError(
-            f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry"
+            f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer"
+            " telemetry"
         )
     coarse = matched(run, answers, tau_s[valid], answers.q[valid])
     try:
@@ -457,11 +467,13 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
             display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
             if display is None:
                 notes.append(
-                    "the display shows too few stars at once for an attitude: its own error was not found"
+                    "the display shows too few stars at once for an attitude: its own error was not"
+                    " found"
                 )
     except HilstarError as refusal:
         notes.append(
-            f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}"
+            "neither the field's magnitude nor the display's own error could be found from the"
+            f" ledger: {refusal}"
         )
     noise_arcsec, said = _without_display(found, display)
     return Assessment(
@@ -527,8 +539,8 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
         angle = float(np.linalg.norm(turn))
         axis = ",".join(f"{value:.3f}" for value in turn / max(angle, 1e-12))
         turned = (
-            f"{telemetry.path}: the reported attitudes are turned by {np.degrees(angle):.4g} degrees about {axis} (cam) from"
-            " the commanded ones"
+            f"{telemetry.path}: the reported attitudes are turned by {np.degrees(angle):.4g}"
+            f" degrees about {axis} (cam) from the commanded ones"
         )
         # The nearest rotation that only names the axes otherwise, of which there are 24.
         matrix, nearest = to_matrix(agreed.rotation), np.zeros((3, 3))
@@ -551,8 +563,9 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
         cure = f"turn them back by the quaternion {w:.6f},{x:.6f},{y:.6f},{z:.6f} from the left"
         raise InputError(f"{turned}: another frame or mounting; {cure}")
     raise InputError(
-        f"{telemetry.path}: at no offset of its clock do the reported attitudes follow those of {run.path}, lit for"
-        f" {commanded.t_s[-1]:.6g} s; give the telemetry of this run, of which no more than half may be wild"
+        f"{telemetry.path}: at no offset of its clock do the reported attitudes follow those of"
+        f" {run.path}, lit for {commanded.t_s[-1]:.6g} s; give the telemetry of this run, of which"
+        " no more than half may be wild"
     )
 
 
@@ -583,17 +596,19 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
     notes, clock, parts = [*found.notes], found.clock, found.components
     if base_s:
         notes.append(
-            f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its clock is taken as one of"
-            " its own"
+            f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its"
+            " clock is taken as one of its own"
         )
     if not clock.drift_told:
         notes.append(
-            "the run has no motion that tells the clock: offset and drift are not known, and times are taken as they are"
+            "the run has no motion that tells the clock: offset and drift are not known, and times"
+            " are taken as they are"
         )
     elif not clock.offset_told:
         notes.append(
-            "the run turns at a constant rate: an offset of the clock cannot be told from a bias along the motion, and is taken"
-            f" to be {1e3 * clock.offset_s:.3g} ms beside the rough one"
+            "the run turns at a constant rate: an offset of the clock cannot be told from a bias"
+            f" along the motion, and is taken to be {1e3 * clock.offset_s:.3g} ms beside the"
+            " rough one"
         )
     # A tracker averages over its exposure E: under an acceleration alpha that is alpha E^2 / 24 off
     # the middle's attitude.
@@ -606,7 +621,8 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
         )
         if bent >= BENT_ARCSEC:
             notes.append(
-                f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec"
+                "in an exposure the attitude's mean differs from that in its middle by up to"
+                f" {bent:.2g} arcsec"
             )
     # Noise that lasts: a slow drift, or an error that changes over the field more sharply than the
     # bumps do.
@@ -617,9 +633,10 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
         if (slow / np.maximum(parts.noise_variance, 1e-12)).max() >= SLOW_SHARE:
             size = axes_of_variance(slow)
             notes.append(
-                f"the noise is not white: {size.cross:.2g} arcsec across the boresight and {size.roll:.2g} about it last for"
-                f" {TOGETHER} answers and more, besides {parts.fov.detail or 'the bias'}: does the alignment drift with time,"
-                " or does the field-of-view error jump somewhere?"
+                f"the noise is not white: {size.cross:.2g} arcsec across the boresight and"
+                f" {size.roll:.2g} about it last for {TOGETHER} answers and more, besides"
+                f" {parts.fov.detail or 'the bias'}: does the alignment drift with time, or does"
+                " the field-of-view error jump somewhere?"
             )
     return notes
 
@@ -634,7 +651,10 @@ def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Ax
     without = axes_of_variance(found.components.noise_variance - share * cost)
     if display.cross_arcsec <= SMALL * noise.cross and display.roll_arcsec <= SMALL * noise.roll:
         return without, []
-    size = f"{display.cross_arcsec:.2g} arcsec across the boresight and {display.roll_arcsec:.2g} about it"
+    size = (
+        f"{display.cross_arcsec:.2g} arcsec across the boresight and {display.roll_arcsec:.2g}"
+        " about it"
+    )
     says = f"the answers show {display.seen:.2f} +- {display.sigma_seen:.2f} of it"
     done = (
         f"{100 * share:.0f} % of its variance are subtracted from the noise"

@@ -196,8 +196,9 @@ class GlassCost:
         """For a person."""
         left = {name: f"{axes.cross or 0.0:.2g}" for name, axes in self.fov_arcsec.items()}
         return (
-            f"{left['total']} arcsec across by the {self.source}, as `{self.centroider}` finds {self.stars} stars; distortion"
-            f" corrected {left['without_distortion']}, colour {left['without_colour']}, both {left['without_both']}"
+            f"{left['total']} arcsec across by the {self.source}, as `{self.centroider}` finds"
+            f" {self.stars} stars; distortion corrected {left['without_distortion']}, colour"
+            f" {left['without_colour']}, both {left['without_both']}"
         )
 
 

@@ -107,23 +107,27 @@ def assess_run(
     free = known & ~held
     if known.sum() < MIN_ROWS:
         raise InputError(
-            f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer telemetry"
+            f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer"
+            " telemetry"
         )
     if free.sum() < MIN_ROWS:
         raise InputError(
-            f"the run missed so many frames that {int(held.sum())} of {int(known.sum())} answers looked while one was held,"
-            f" and {MIN_ROWS} others are needed; give a run that keeps its refresh rate, or a lower [monitor] refresh_hz"
+            f"the run missed so many frames that {int(held.sum())} of {int(known.sum())} answers"
+            f" looked while one was held, and {MIN_ROWS} others are needed; give a run that keeps"
+            " its refresh rate, or a lower [monitor] refresh_hz"
         )
     if 2 * clock.used.sum() <= free.sum():
         raise InputError(
-            f"half or more of the answers are wild: {int(clock.used.sum())} of {int(free.sum())} agree with one rotation"
+            f"half or more of the answers are wild: {int(clock.used.sum())} of {int(free.sum())}"
+            " agree with one rotation"
         )
     spread = MAD_TO_SIGMA * float(
         np.median(np.abs(clock.residual_arcsec[clock.used][:, :2]), axis=0).max()
     )
     if spread > MAX_SPREAD_ARCSEC:
         raise InputError(
-            f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of another run"
+            f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of"
+            " another run"
         )
     total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
     right, parts = _right_answers(total, clock.moments.q, clock.used, scale)

@@ -5,7 +5,8 @@ place in the field of view is a sum of bumps F c (see `places`). The part that r
 place within a pixel is a sum of waves P d. Both are fitted in turns until they hold, and the rest
 is noise. With r the rest, and p_F, p_P the degrees of freedom of the fits,
 
-    sigma^2 = |r|^2 / (n - 1 - p_F - p_P),    fov^2 = (|F c|^2 - p_F sigma^2) / n,    pixel^2 = (|P d|^2 - p_P sigma^2) / n:
+    sigma^2 = |r|^2 / (n - 1 - p_F - p_P),
+    fov^2 = (|F c|^2 - p_F sigma^2) / n,    pixel^2 = (|P d|^2 - p_P sigma^2) / n:
 
 a fit takes up its degrees of freedom's share of the noise. That share is subtracted, so that none
 of the three depends on how many functions were tried.
@@ -149,7 +150,10 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector
     if extent_px < MIN_EXTENT_PX:
         return (
             None,
-            f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias",
+            (
+                f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be"
+                " told from bias"
+            ),
         )
     spacing = FINEST_PX
     while spacing <= COARSEST_SHARE * min(scale.resolution_px):
@@ -179,7 +183,10 @@ def _waves(
         return None, replace(none, reason=reason)
     tried = [*global_phases(about, q_icrs_to_cam, scale)]
     if bumps is not None and max(_apart(phases.columns(), bumps) for phases in tried) < APART:
-        reason = "each place within a pixel was seen at one place in the field only: pixel error cannot be told from it"
+        reason = (
+            "each place within a pixel was seen at one place in the field only: pixel error cannot"
+            " be told from it"
+        )
         return None, replace(none, reason=reason)
     freedom = 0.0 if bumps is None else bumps.freedom
     waves, found, best = _best_of(tried, about, freedom)

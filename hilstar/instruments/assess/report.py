@@ -128,7 +128,10 @@ def limit_text(limit: Axes | None) -> str:
     """The smallest noise that a tracker's stars allow, in words."""
     if limit is None or limit.cross is None or limit.roll is None:
         return "not known"
-    return f"{limit.cross:.3g} arcsec across, {limit.roll:.3g} about the boresight (Cramer-Rao, one exposure at rest)"
+    return (
+        f"{limit.cross:.3g} arcsec across, {limit.roll:.3g} about the boresight (Cramer-Rao, one"
+        " exposure at rest)"
+    )
 
 
 def rows_of(found: Assessment) -> Iterator[FigureRow]:
@@ -216,9 +219,18 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
     wait = "-" if wait_s is None else f"{wait_s:.3g}"
     own = "not looked at"
     if display is not None:
-        own = f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the boresight,"
-        own += f" at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of it in the answers"
-    answers = f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and {len(found.telemetry.t_ns)} rows"
+        own = (
+            f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the"
+            " boresight,"
+        )
+        own += (
+            f" at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of"
+            " it in the answers"
+        )
+    answers = (
+        f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and"
+        f" {len(found.telemetry.t_ns)} rows"
+    )
     answers += (
         f"; {found.out_of_order} came out of order, sorted by their stamps"
         if found.out_of_order
@@ -233,13 +245,18 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("noise", _text(found.noise_arcsec, parts.intervals.noise)),
         (
             "clock",
-            f"offset {offset}, fast by {drift}"
-            if clock.drift_told
-            else "cannot be told: the run does not turn enough",
+            (
+                f"offset {offset}, fast by {drift}"
+                if clock.drift_told
+                else "cannot be told: the run does not turn enough"
+            ),
         ),
         (
             "availability",
-            f"{100 * lock.availability:.2f} % of {lock.due} answers due, one each {1e3 * lock.cycle_s:.4g} ms",
+            (
+                f"{100 * lock.availability:.2f} % of {lock.due} answers due, one each"
+                f" {1e3 * lock.cycle_s:.4g} ms"
+            ),
         ),
         ("lock lost", f"{len(lock.lost)} times"),
         ("acquisition", "-" if share is None else f"{100 * share:.0f} %, median {wait} s"),
@@ -258,7 +275,10 @@ def _bench_text(found: Assessment) -> str:
     if part["share_of_bias"] is None:
         return said
     cross, roll = (100 * share for share in part["share_of_bias"].values())
-    return f"{said}; it could have made {cross:.0f} % of the bias across and {roll:.0f} % of that about"
+    return (
+        f"{said}; it could have made {cross:.0f} % of the bias across and {roll:.0f} % of that"
+        " about"
+    )
 
 
 def _text(axes: Axes, interval: FloatArray) -> str:
@@ -266,7 +286,10 @@ def _text(axes: Axes, interval: FloatArray) -> str:
         return "cannot be told"
     (cross_low, roll_low), (cross_high, roll_high) = interval.tolist()
     cross = f"{axes.cross:.3g} ({cross_low:.3g} to {cross_high:.3g})"
-    return f"{cross} across, {axes.roll:.3g} ({roll_low:.3g} to {roll_high:.3g}) arcsec about the boresight"
+    return (
+        f"{cross} across, {axes.roll:.3g} ({roll_low:.3g} to {roll_high:.3g}) arcsec about the"
+        " boresight"
+    )
 
 
 def write_page(path: Path, found: Assessment) -> None:
@@ -329,8 +352,14 @@ def _over_time(found: Assessment) -> str:
     some = np.unique(np.linspace(0, len(t_s) - 1, MAX_POINTS).astype(int))
     repeating = parts.fov.fitted + parts.pixel.fitted
     rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
-    finding = f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g} about the boresight"
-    note = "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost. Dotted lines: wrong answers."
+    finding = (
+        f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g}"
+        " about the boresight"
+    )
+    note = (
+        "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost."
+        " Dotted lines: wrong answers."
+    )
     with panels_of(finding, 3, note=note, height_inch=7.0) as panels:
         for axes, name, k in zip(panels, AXES, range(3), strict=True):
             axes.plot(
@@ -377,7 +406,10 @@ def _field_map(found: Assessment) -> str:
         return f"<p>{escaped(reason)}.</p>"
     place = scale.focal_px * seen[:, :2] / seen[:, 2:]
     largest = np.abs(parts.fov.fitted).max(axis=0)
-    finding = f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g} about the boresight"
+    finding = (
+        f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g}"
+        " about the boresight"
+    )
     with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
         for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
             value, limit = parts.fov.fitted[some, k], max(float(largest[k]), 1e-6)
@@ -401,8 +433,14 @@ def _field_map(found: Assessment) -> str:
 def _histogram(found: Assessment) -> str:
     left, variance = found.found.components.left, found.found.components.noise_variance
     sigmas = np.sqrt(variance)
-    finding = f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the boresight, one sigma"
-    note = "Bars: what is left when all that repeats is taken away. Line: the normal distribution of that sigma."
+    finding = (
+        f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the"
+        " boresight, one sigma"
+    )
+    note = (
+        "Bars: what is left when all that repeats is taken away. Line: the normal distribution of"
+        " that sigma."
+    )
     with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.6) as panels:
         for k, (axes, name) in enumerate(zip(panels, AXES, strict=True)):
             sigma = max(float(sigmas[k]), 1e-9)

@@ -59,8 +59,14 @@ FLOOR_RAD = 1e-3 / ARCSEC_PER_RAD  # smallest noise: quaternions are rounded
 MIN_EXPLAINED = 0.5  # share of the residual's squares that a named cause explains
 MIN_ATTITUDES = 6  # minimum from which a cause is sought
 MAX_NAMED = 10  # wild rows
-ONE_ATTITUDE = "one attitude: it determines the rotation, but does not tell what changes with attitude; take several, all over the sky"
-NO_REPEATS = "no attitude was repeated: the residual cannot be told from the tracker's noise; take some attitudes several times"
+ONE_ATTITUDE = (
+    "one attitude: it determines the rotation, but does not tell what changes with attitude; take"
+    " several, all over the sky"
+)
+NO_REPEATS = (
+    "no attitude was repeated: the residual cannot be told from the tracker's noise; take some"
+    " attitudes several times"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,15 +143,16 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
     if len(pairs) < MIN_PAIRS:
         skipped = f" ({pairs.skipped} more are not valid)" if pairs.skipped else ""
         raise InputError(
-            f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more attitudes"
+            f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more"
+            " attitudes"
         )
     refuse_conventions(pairs, camera.field_radius_rad(0.0))
     fit = fit_rotation(multiply(pairs.reported, conjugate(pairs.commanded)))
     used = fit.used
     if 2 * used.sum() <= len(pairs):
         raise InputError(
-            f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of {len(pairs)} agree; look for"
-            " lost stars, and rows of other times"
+            f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of"
+            f" {len(pairs)} agree; look for lost stars, and rows of other times"
         )
     rate_rad_s = None if pairs.rate_rad_s is None else pairs.rate_rad_s[used]
     covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
@@ -247,7 +254,8 @@ def _causes(
     if turn is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(turn))
         causes.append(
-            f"a reference frame turned by {size:.3g} arcsec explains most of it: does the tracker report in ICRS, not of date?"
+            f"a reference frame turned by {size:.3g} arcsec explains most of it: does the tracker"
+            " report in ICRS, not of date?"
         )
     if rate_rad_s is not None:
         late = _explained(means, -_means(rate_rad_s @ to_matrix(q).T, group)[:, :, None])
@@ -259,7 +267,8 @@ def _causes(
     if drift is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(drift))
         causes.append(
-            f"a drift by {size:.3g} arcsec from the first row to the last explains most of it: did the mount move?"
+            f"a drift by {size:.3g} arcsec from the first row to the last explains most of it: did"
+            " the mount move?"
         )
     return tuple(causes)
 
@@ -364,9 +373,9 @@ def summary_of(found: Aligned) -> dict[str, Any]:
         "sigma_arcsec": found.sigma_arcsec,
         "residual_arcsec": asdict(residual.rms),
         "repeat_arcsec": None if residual.repeat is None else asdict(residual.repeat),
-        "unexplained_arcsec": None
-        if residual.unexplained is None
-        else asdict(residual.unexplained),
+        "unexplained_arcsec": (
+            None if residual.unexplained is None else asdict(residual.unexplained)
+        ),
         "q_cam_to_mon": found.q_cam_to_mon.tolist(),
         "notes": remarks_of(found),
     }
@@ -386,7 +395,8 @@ def remarks_of(found: Aligned) -> tuple[str, ...]:
             f"{value:.3g} arcsec rms {where} the boresight" for where, value in parts if value > 0
         )
         remarks.append(
-            f"a rotation does not explain {excess}: calibrate the geometry with dots (hilstar calibrate geometric)"
+            f"a rotation does not explain {excess}: calibrate the geometry with dots (hilstar"
+            " calibrate geometric)"
         )
     return (*remarks, *residual.causes)
 

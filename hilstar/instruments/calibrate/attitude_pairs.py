@@ -41,7 +41,10 @@ MAX_TABLE_BYTES = 200_000_000
 MAX_ROWS = 100_000
 COMMANDED, REPORTED = ("qw", "qx", "qy", "qz"), ("tw", "tx", "ty", "tz")
 SKIP = "delete the row, or write valid = 0"
-PAIRS_ADVICE = f"write a CSV with the columns {','.join((*COMMANDED, *REPORTED))} (commanded, then the tracker's; scalar first)"
+PAIRS_ADVICE = (
+    f"write a CSV with the columns {','.join((*COMMANDED, *REPORTED))} (commanded, then the"
+    " tracker's; scalar first)"
+)
 # two rotations further apart do not belong to one alignment, whatever the noise
 AGREE_RAD = np.radians(1.0)
 # one of them is near the truth with probability 1 - 2^-100 while fewer than half are wild
@@ -114,8 +117,8 @@ def _unit(path: Path, lines: IntArray, q: FloatArray, names: tuple[str, ...]) ->
     if off.any():
         first = int(np.argmax(off))
         raise InputError(
-            f"{path}:{lines[first]}: the norm of {','.join(names)} is {norm[first]:.6g}; write unit quaternions, within"
-            f" {NORM_TOLERANCE:g}"
+            f"{path}:{lines[first]}: the norm of {','.join(names)} is {norm[first]:.6g}; write unit"
+            f" quaternions, within {NORM_TOLERANCE:g}"
         )
     return normalise(q) if len(q) else q
 
@@ -137,8 +140,8 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
         spans = (times + run.zero_ns / NS_PER_S for times in (t_s, run.commanded.t_s))
         said, lit = (f"{span.min():.3f} to {span.max():.3f} s" for span in spans)
         raise InputError(
-            f"{path}: its times, {said}, meet no frame of {ledger}, lit from {lit} on the sender's clock; write t_s"
-            " on that clock, or add --offset-s"
+            f"{path}: its times, {said}, meet no frame of {ledger}, lit from {lit} on the sender's"
+            " clock; write t_s on that clock, or add --offset-s"
         )
     return Pairs(
         source=path,
@@ -260,9 +263,15 @@ def _conventions(names: tuple[str, ...]) -> Iterator[tuple[Change, Change, str]]
     yield _as_is, _scalar_last, f"{tracker} {last}"
     yield _as_is, lambda q: conjugate(_scalar_last(q)), f"{tracker} {last}; and they {inverse}"
     for axis, signs in (("x", (1, 1, -1, -1)), ("y", (1, -1, 1, -1)), ("z", (1, -1, -1, 1))):
-        cure = f"are mirrored in {axis}: write them for right-handed axes, x right and y down in the image"
+        cure = (
+            f"are mirrored in {axis}: write them for right-handed axes, x right and y down in the"
+            " image"
+        )
         yield _as_is, partial(np.multiply, np.array(signs, dtype=np.float64)), f"{tracker} {cure}"
-    both = "either both quaternions are the inverse (cam to ICRS) or have the scalar last, or the tracker's reference frame is not"
+    both = (
+        "either both quaternions are the inverse (cam to ICRS) or have the scalar last, or the"
+        " tracker's reference frame is not"
+    )
     yield conjugate, conjugate, f"{both} ICRS; write q_icrs_to_cam, scalar first, in ICRS"
     yield _scalar_last, _as_is, "the commanded quaternions have the scalar last; write w first"
     yield (
@@ -292,17 +301,20 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
     agrees = spread <= AGREE_RAD
     if cure and (not agrees or out_of_view or (spread > CLEARLY_RAD and CLEARLY * best < spread)):
         raise InputError(
-            f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes; {cure}"
+            f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes;"
+            f" {cure}"
         )
     if not agrees:
         raise InputError(
-            f"{pairs.source}: half or more of the reported attitudes are wild: no more than half of {len(pairs)} agree within"
-            f" {np.degrees(AGREE_RAD):g} degree of one rotation; look for lost stars, rows of other times, or another sky"
+            f"{pairs.source}: half or more of the reported attitudes are wild: no more than half of"
+            f" {len(pairs)} agree within {np.degrees(AGREE_RAD):g} degree of one rotation; look for"
+            " lost stars, rows of other times, or another sky"
         )
     if out_of_view:
         raise InputError(
-            f"{pairs.source}: the z axis of the reported attitudes is {np.degrees(_boresight_rad(rotation)):.3g} degrees off"
-            " the boresight, and the screen would be out of view; write them for cam axes (z boresight, x right, y down)"
+            f"{pairs.source}: the z axis of the reported attitudes is"
+            f" {np.degrees(_boresight_rad(rotation)):.3g} degrees off the boresight, and the screen"
+            " would be out of view; write them for cam axes (z boresight, x right, y down)"
         )
 
 

@@ -189,7 +189,8 @@ def effective_psf(
     _, data = matched(dots, nominal, seen, look)
     if len(np.unique(data.dot)) < MIN_DOTS:
         raise InputError(
-            f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed; show more dots or frames"
+            f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed; show more"
+            " dots or frames"
         )
     under = None if dark is None else read_image(dark, config.tracker.resolution_px)
     sides = _dot_sides(data, dots.x_px, dots.y_px)
@@ -281,8 +282,8 @@ def _of_frames(sums: tuple[FloatArray, FloatArray, FloatArray], places: tuple[An
     kept = np.flatnonzero((lit > 0) & np.isfinite(total).all(axis=(1, 2)))
     if len(kept) < MIN_DOTS:
         raise InputError(
-            f"{len(kept)} dots stand alone by {2 * MAX_HALF_PX} px in some frame, and {MIN_DOTS} are needed; plan fewer"
-            " --dots in a frame"
+            f"{len(kept)} dots stand alone by {2 * MAX_HALF_PX} px in some frame, and {MIN_DOTS}"
+            " are needed; plan fewer --dots in a frame"
         )
     mean = total[kept] / lit[kept, None, None]
     spread = squares[kept] / lit[kept, None, None] - mean**2
@@ -582,7 +583,10 @@ def _glass(model: Effective, place: FloatArray, half_px: int, per_px: int) -> Gl
 def draw_effective(path: Path, found: Found) -> None:
     """Draw the PSFs at the corners, edges and middle of the field."""
     images = found.glass.images[:, 0, 0]
-    finding = f"Held-out dots: {found.chosen.name} is off by {found.chosen.rms:.2%} of the peak, noise by {found.chosen.noise:.2%}"
+    finding = (
+        f"Held-out dots: {found.chosen.name} is off by {found.chosen.rms:.2%} of the peak, noise by"
+        f" {found.chosen.noise:.2%}"
+    )
     with chart(path, finding, height_inch=6.6) as (axes,):
         picked = images.reshape(POINTS, POINTS, *images.shape[1:])[:: POINTS // 2, :: POINTS // 2]
         # points are sorted by x, then y
@@ -631,7 +635,10 @@ def lines_of(found: Found) -> list[str]:
         *(
             (
                 m.name,
-                f"{m.rms:.2%} of the peak off held-out dots (noise: {m.noise:.2%}), reduced chi square {m.chi2.mean():.2f}",
+                (
+                    f"{m.rms:.2%} of the peak off held-out dots (noise: {m.noise:.2%}), reduced chi"
+                    f" square {m.chi2.mean():.2f}"
+                ),
             )
             for m in found.models
         ),

@@ -61,7 +61,8 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
     ]
     if len(found) < MIN_EDGES:
         raise InputError(
-            f"serial:{port}@{baud}: {len(found)} edges came, and at least {MIN_EDGES} are needed; {DEVICE_FORM}"
+            f"serial:{port}@{baud}: {len(found)} edges came, and at least {MIN_EDGES} are needed;"
+            f" {DEVICE_FORM}"
         )
     host_ns = np.array([host for host, _ in found], dtype=np.int64)
     level = np.array([int(match[1]) for _, match in found], dtype=np.int64)
@@ -226,8 +227,8 @@ def checked_delay_ms(panel_delay_ms: float) -> float:
     """
     if panel_delay_ms < 0:
         raise InputError(
-            f"the square lit {-panel_delay_ms:.2f} ms before the scan-out could reach it; set [monitor] scanout_ms to what the "
-            "panel needs (0 where all rows light at once)"
+            f"the square lit {-panel_delay_ms:.2f} ms before the scan-out could reach it; set"
+            " [monitor] scanout_ms to what the panel needs (0 where all rows light at once)"
         )
     return round(panel_delay_ms, 3)
 
@@ -249,7 +250,8 @@ def write_panel_delay(path: Path, panel_delay_ms: float, error_ms: float) -> Non
     text = with_key(text, "certify", "panel_delay_u_ms", float(f"{error_ms:.3g}"))
     if parse_toml(path, text).get("monitor", {}).get("panel_delay_ms") != value:
         raise InputError(
-            f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not in plain form"
+            f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not"
+            " in plain form"
         )
     write_whole(path, text)
 
@@ -303,16 +305,21 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
     )
     figures = {
         "edges": f"{summary['edges']} paired, {summary['unmatched']} without a frame",
-        "swap to light": f"{latency['p1']:.2f} / {latency['p50']:.2f} / {latency['p99']:.2f} ms (p1 / p50 / p99)",
+        "swap to light": (
+            f"{latency['p1']:.2f} / {latency['p50']:.2f} / {latency['p99']:.2f} ms (p1 / p50 / p99)"
+        ),
         "rise, fall": f"{rise}, {fall} ms (medians)",
         "jitter": f"{summary['jitter_ms']:.3f} ms (standard deviation)",
-        "beat with the exposure": f"{turn['refreshes_per_exposure']:.3f} refreshes in one; {every}; {cost}",
+        "beat with the exposure": (
+            f"{turn['refreshes_per_exposure']:.3f} refreshes in one; {every}; {cost}"
+        ),
         "of this, scan-out": f"{summary['swap_to_square_ms']:.2f} ms to the square",
         "panel_delay_ms": f"{summary['panel_delay_ms']:.3f} +- {summary['panel_delay_u_ms']:.3f}",
     }
     if summary["ambiguous"]:
         figures["note"] = (
-            'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code" tells which'
+            'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code"'
+            " tells which"
         )
     return [f"{what:24}{how_much}" for what, how_much in figures.items()]
 

@@ -219,7 +219,8 @@ def _row(place: str, cells: dict[str, str]) -> _Row:
     value = _number(place, "value", cells["value"])
     if value < 0:
         raise InputError(
-            f"{place}: value = {value:g}; light is not negative; write readings from which no offset was subtracted"
+            f"{place}: value = {value:g}; light is not negative; write readings from which no"
+            " offset was subtracted"
         )
     exposure_s = _number(place, "exposure_s", cells.get("exposure_s") or "1")
     if exposure_s <= 0:
@@ -315,19 +316,23 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
     place = f"{measured.source}: channel {channel}"
     if levels.code[0] != 0:
         raise InputError(
-            f"{place}: code 0 is not measured; without it the black level is unknown, so add it, several times"
+            f"{place}: code 0 is not measured; without it the black level is unknown, so add it,"
+            " several times"
         )
     if levels.code[-1] != measured.white:
         raise InputError(
-            f"{place}: white, code {measured.white} of {measured.bits} bits, is not measured; add it or say --bits"
+            f"{place}: white, code {measured.white} of {measured.bits} bits, is not measured; add"
+            " it or say --bits"
         )
     if len(levels.code) < MIN_CODES:
         raise InputError(
-            f"{place}: {len(levels.code)} distinct codes; measure {MIN_CODES} or more, 32 for 1 % (calibrate plan)"
+            f"{place}: {len(levels.code)} distinct codes; measure {MIN_CODES} or more, 32 for 1 %"
+            " (calibrate plan)"
         )
     if not levels.mean[-1] > levels.mean[0]:
         raise InputError(
-            f"{place}: white is not brighter than code 0; check that the instrument looks at the patch"
+            f"{place}: white is not brighter than code 0; check that the instrument looks at the"
+            " patch"
         )
     relative = levels.relative_noise
     if math.isnan(relative):
@@ -341,8 +346,9 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
     if fall[worst] > FALSE_ALARM_SIGMA:
         percent = 100 * (1 - levels.mean[worst] / highest[worst])
         raise InputError(
-            f"{place}: light falls by {percent:.2g} % from code {levels.code[peak[worst]]} to code {levels.code[worst]}, beyond"
-            " the noise; measure both again, with the monitor's dynamic contrast off"
+            f"{place}: light falls by {percent:.2g} % from code {levels.code[peak[worst]]} to code"
+            f" {levels.code[worst]}, beyond the noise; measure both again, with the monitor's"
+            " dynamic contrast off"
         )
 
 
@@ -361,8 +367,9 @@ def _check_saturation(
         clipped = levels.code[int(np.argmax(flat)) :].tolist()
     if clipped:
         raise InputError(
-            f"{measured.source}: channel {channel}: codes {clipped[0]} to {clipped[-1]} read the same, so the instrument is"
-            " saturated or the link clips; shorten the exposure, or set the link to full range"
+            f"{measured.source}: channel {channel}: codes {clipped[0]} to {clipped[-1]} read the"
+            " same, so the instrument is saturated or the link clips; shorten the exposure, or set"
+            " the link to full range"
         )
 
 
@@ -396,7 +403,8 @@ def check_drift(measured: Measurements) -> float:
     drift, error = drift_over_run(measured)
     if abs(drift) > max(FALSE_ALARM_SIGMA * error, MIN_DRIFT):
         raise InputError(
-            f"{measured.source}: light drifts by {100 * drift:+.2g} % (noise {100 * error:.1g} %) from the first measurement to"
-            " the last; let monitor and instrument warm up, then measure again"
+            f"{measured.source}: light drifts by {100 * drift:+.2g} % (noise {100 * error:.1g} %)"
+            " from the first measurement to the last; let monitor and instrument warm up, then"
+            " measure again"
         )
     return drift

@@ -173,7 +173,8 @@ def fit_channel(measured: measurements.Measurements, channel: str) -> ChannelFit
         return fit_levels(levels, measured.white)
     except np.linalg.LinAlgError as error:
         raise InputError(
-            f"{measured.source}: channel {channel}: no smooth response fits these values; check them"
+            f"{measured.source}: channel {channel}: no smooth response fits these values; check"
+            " them"
         ) from error
 
 
@@ -592,10 +593,14 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     left = held_out(worst)
     repeats = worst.levels.reading_noise(worst.noise_relative)
     finding = (
-        f"Levels held out of the fit are {left['rms_percent']:.2g} % ({left['rms_mag']:.2g} mag) rms off,"
-        f" {left['max_percent']:.2g} % at the maximum; a patch repeats to {100 * repeats:.2g} %"
+        f"Levels held out of the fit are {left['rms_percent']:.2g} % ({left['rms_mag']:.2g} mag)"
+        f" rms off, {left['max_percent']:.2g} % at the maximum; a patch repeats to"
+        f" {100 * repeats:.2g} %"
     )
-    note = "Lines: the fit. Dots: measured above, held out of the fit below. Dotted: black. Bands: the fit's error."
+    note = (
+        "Lines: the fit. Dots: measured above, held out of the fit below. Dotted: black. Bands: the"
+        " fit's error."
+    )
     with chart(path, finding, panels=2, note=note) as (response, residual):
         for name, fit in fits.items():
             colour, code, white = COLOURS[name], fit.levels.code[1:], fit.white

@@ -59,8 +59,8 @@ class PlanSettings:
             or not 1 <= self.repeats <= 1000
         ):
             raise InputError(
-                f"plan of {self.levels} levels, {self.repeats} repeats, {self.bits} bits; write 1 to 16 bits, 2 to 2^bits"
-                " levels and 1 to 1000 repeats"
+                f"plan of {self.levels} levels, {self.repeats} repeats, {self.bits} bits; write 1"
+                " to 16 bits, 2 to 2^bits levels and 1 to 1000 repeats"
             )
         channels = set(self.channels)
         if not channels or channels - set(CHANNELS) or len(channels) < len(self.channels):
@@ -170,7 +170,8 @@ def write_patches(
     patches = sorted(set(planned))
     if bits > 8 and any(patch.channel != "w" for patch in patches):
         raise InputError(
-            "patches of r, g or b are written as PNG for up to 8 bits; leave the directory out, and show the codes of the plan"
+            "patches of r, g or b are written as PNG for up to 8 bits; leave the directory out, and"
+            " show the codes of the plan"
         )
     for patch in patches:
         path = folder / f"{patch.channel}-{patch.code:05d}.png"

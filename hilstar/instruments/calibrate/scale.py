@@ -103,7 +103,8 @@ def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: floa
         named = f"--reading {reading.hip}"
         if not len(place):
             raise InputError(
-                f"{named}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag"
+                f"{named}: the bench has no such star; take one of [sky] catalogue within"
+                " faintest_v_mag"
             )
         rate = float(bench.stars.electrons_per_s[place[0]])
         if rate * bench.psf.peak_share > bench.flux_at_white_e_per_s:
@@ -127,7 +128,8 @@ def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> N
     """
     if output.resolve().parent != file.path.resolve().parent:
         raise InputError(
-            f"{output}: the bench file's paths are relative to it; write the copy beside {file.path}"
+            f"{output}: the bench file's paths are relative to it; write the copy beside"
+            f" {file.path}"
         )
     key, flux_at_white_e_per_s = "flux_at_white_e_per_s", found.flux_at_white_e_per_s
     text = with_key(
@@ -141,5 +143,6 @@ def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> N
     write_whole(output, text)
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
         raise InputError(
-            f"{output}: the key could not be set in this file; write {key} = {flux_at_white_e_per_s!r} under [render] yourself"
+            f"{output}: the key could not be set in this file; write {key} ="
+            f" {flux_at_white_e_per_s!r} under [render] yourself"
         )

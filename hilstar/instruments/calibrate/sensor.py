@@ -224,7 +224,8 @@ def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
         if abs(value - keys[key]) > rounded * abs(keys[key]):
             other = f"{first[key].place.rpartition(':')[2]} has {first[key].name} for {keys[key]:g}"
             raise InputError(
-                f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave one of them"
+                f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave"
+                " one of them"
             )
     return {key: keys[key] for key in dict.fromkeys(reading.quantity.key for reading in readings)}
 
@@ -252,7 +253,8 @@ def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
             )
         except msgspec.MsgspecError as error:
             raise InputError(
-                f"{path}: {shortened(str(error))}; write a list of objects with quantity, value, unit"
+                f"{path}: {shortened(str(error))}; write a list of objects with quantity, value,"
+                " unit"
             ) from error
         rows = [
             (number, [str(row.get(name, "")) for name in columns])
@@ -323,7 +325,8 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
             and (seconds == again or (math.isnan(seconds) and math.isnan(again)))
         ):
             raise InputError(
-                f"{second}: its size or EXPTIME is not that of {first}; give two frames of each exposure"
+                f"{second}: its size or EXPTIME is not that of {first}; give two frames of each"
+                " exposure"
             )
         pattern = float(np.mean((a - a.mean()) * (b - b.mean())))
         if not math.isfinite(pattern):
@@ -335,7 +338,8 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
     mean, temporal, spatial, exposure_s = np.array(sorted(rows)).T
     if 0 < np.isnan(exposure_s).sum() < len(exposure_s):
         raise InputError(
-            f"{what}: some frames say no exposure and some do; write {EXPOSURE_KEY} into all of them"
+            f"{what}: some frames say no exposure and some do; write {EXPOSURE_KEY} into all of"
+            " them"
         )
     return Levels(mean, temporal, spatial, exposure_s, largest_dn, shape)
 
@@ -352,8 +356,8 @@ def _refuse_unlike_darks(dark: Levels) -> None:
     spread_dn = float(np.ptp(dark.mean_dn))
     if np.isnan(dark.exposure_s).any() and spread_dn > DARK_SPREAD * noise_dn:
         raise InputError(
-            f"--darks: their means differ by {spread_dn:.3g} DN, and no header says their exposures; write them,"
-            f" in seconds, as {EXPOSURE_KEY}, or give darks of one exposure"
+            f"--darks: their means differ by {spread_dn:.3g} DN, and no header says their"
+            f" exposures; write them, in seconds, as {EXPOSURE_KEY}, or give darks of one exposure"
         )
 
 
@@ -386,7 +390,8 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     )
     if not k_dn_per_e > 0:
         raise InputError(
-            "FLATS: no noise that grows with light; give raw frames of one sensor from dark to saturation"
+            "FLATS: no noise that grows with light; give raw frames of one sensor from dark to"
+            " saturation"
         )
     k_error = float(weight.sum()) ** -0.5 / k_dn_per_e
     half = int(usable[np.abs(signal[usable] - signal[top] / 2).argmin()])
@@ -414,7 +419,8 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
         "prnu", pattern_dn2, light.pattern_error_dn2[half] / math.sqrt(pixels), signal[half], 0.0
     )
     notes = [
-        f"{len(signal)} levels of light, {len(dark.mean_dn)} of dark, {pixels} px; light that is not even counts as PRNU"
+        f"{len(signal)} levels of light, {len(dark.mean_dn)} of dark, {pixels} px; light that is"
+        " not even counts as PRNU"
     ]
     if dark.timed:
         add("dark_e_per_s", mean[0], mean_error[0])
@@ -447,7 +453,10 @@ def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
     if sensor.efficiency:
         lines += [
             "[tracker]",
-            f"quantum_efficiency = {json.dumps(curve.name) if many else f'{sensor.efficiency[0][1]:.6g}'}",
+            (
+                "quantum_efficiency ="
+                f" {json.dumps(curve.name) if many else f'{sensor.efficiency[0][1]:.6g}'}"
+            ),
         ]
     if many:
         charts.write_csv(curve, ("wavelength_nm", "value"), sensor.efficiency)
@@ -465,7 +474,10 @@ def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> N
     file's lines, measured points.
     """
     gain, measured = settings.gain_e_per_dn, sensor.transfer is not None and sensor.dark is not None
-    finding = f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at {settings.full_well_e:.0f} e-"
+    finding = (
+        f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at"
+        f" {settings.full_well_e:.0f} e-"
+    )
     signal_dn = np.array(
         [0.0, settings.full_well_e / gain if sensor.transfer is None else sensor.transfer[0].max()]
     )

@@ -77,14 +77,26 @@ class WarmUp:
         """The finding in a sentence."""
         limit = f"{100 * self.limit:g} %"
         if self.law == "none":
-            return f"white is not stable to {limit}: the last readings follow neither a line nor an exponential"
-        drift = f"it drifts by {self.drift_percent_per_h:+.2f} +- {self.drift_error_percent_per_h:.2f} %/h at the end"
+            return (
+                f"white is not stable to {limit}: the last readings follow neither a line nor an"
+                " exponential"
+            )
+        drift = (
+            f"it drifts by {self.drift_percent_per_h:+.2f} +- {self.drift_error_percent_per_h:.2f}"
+            " %/h at the end"
+        )
         after = f"{self.stable_after_s:.0f} +- {self.stable_after_error_s:.0f} s"
         if self.is_stable:
             first = f"from the first reading, at {self.from_s:.0f} s, on"
-            return f"white is stable to {limit} {first if self.stable_after_s <= self.from_s else f'after {after}'}; {drift}"
+            return (
+                f"white is stable to {limit}"
+                f" {first if self.stable_after_s <= self.from_s else f'after {after}'}; {drift}"
+            )
         if self.law == "exponential":
-            return f"white is not yet stable to {limit}: by its exponential it is after {after}; {drift}"
+            return (
+                f"white is not yet stable to {limit}: by its exponential it is after {after};"
+                f" {drift}"
+            )
         return f"white is not shown to be stable to {limit}: {drift}"
 
     @property
@@ -92,7 +104,10 @@ class WarmUp:
         """What to do where white is not stable."""
         if self.law == "exponential" and math.isfinite(self.stable_after_s):
             return "wait until then, and watch it again"
-        return "watch it for longer (--warm-up), and look at dynamic contrast, local dimming and stray light"
+        return (
+            "watch it for longer (--warm-up), and look at dynamic contrast, local dimming and stray"
+            " light"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +168,12 @@ class _Law:
                 for step in np.diag(steps)
             ]
         )
-        return at.tolist(), np.sqrt(
-            np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)
-        ).tolist()
+        return (
+            at.tolist(),
+            np.sqrt(
+                np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)
+            ).tolist(),
+        )
 
     @staticmethod
     def _figures(parameters: FloatArray, span_s: float, limit: float) -> FloatArray:
@@ -210,7 +228,8 @@ def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> 
         np.isfinite(light).all() and (light > 0).all() and (np.diff(t_s) > 0).all()
     ):
         raise InputError(
-            f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at rising times"
+            f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at"
+            " rising times"
         )
     for first in (part * len(light) // PARTS for part in range(PARTS)):
         if len(light) - first < MIN_READINGS:

@@ -50,7 +50,8 @@ def bench_lines(summary: dict[str, Any]) -> list[str]:
             f"case {each['case']} by {each['off_deg']:.3g} deg" for each in wrong[:MAX_NAMED]
         )
         lines.append(
-            f"wrong answers in {len(wrong)} cases: {named}{', ...' if len(wrong) > MAX_NAMED else ''}"
+            f"wrong answers in {len(wrong)} cases:"
+            f" {named}{', ...' if len(wrong) > MAX_NAMED else ''}"
         )
     if drift is not None:
         parts = [
@@ -61,7 +62,8 @@ def bench_lines(summary: dict[str, Any]) -> list[str]:
             "" if drift["mag"] is None else f", {drift['mag']:.3g}{_sigma(drift['sigma_mag'])} mag"
         )
         lines.append(
-            f"{'drift of the bench':20}{', '.join(parts)} arcsec about x, y, z{mag}, by {drift['checks']} check cases"
+            f"{'drift of the bench':20}{', '.join(parts)} arcsec about x, y, z{mag}, by"
+            f" {drift['checks']} check cases"
         )
     return lines
 

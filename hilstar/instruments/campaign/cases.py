@@ -299,8 +299,9 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
         table = parameter.key.split(".")[0]
         if plan.through == "bench" and table not in ON_BENCH:
             raise InputError(
-                f'[[vary]] key = "{parameter.key}": cannot be changed on a real bench; write a key of [sky], [render] or'
-                " [spacecraft], rate_deg_s.*, time_s or scenario, or leave it out"
+                f'[[vary]] key = "{parameter.key}": cannot be changed on a real bench; write a key'
+                " of [sky], [render] or [spacecraft], rate_deg_s.*, time_s or scenario, or leave"
+                " it out"
             )
         if plan.through == "tracker" and table in {
             "monitor",
@@ -310,8 +311,8 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             "misalignment_arcsec",
         }:
             raise InputError(
-                f'[[vary]] key = "{parameter.key}": changes nothing for through = "tracker", which sees no display; write'
-                ' through = "display", or leave it out'
+                f'[[vary]] key = "{parameter.key}": changes nothing for through = "tracker", which'
+                ' sees no display; write through = "display", or leave it out'
             )
         if plan.attitudes.kind == "log" and parameter.key == "time_s":
             raise InputError(
@@ -329,8 +330,8 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             file.config.collimator.geometry or file.config.verify.true_geometry
         ):
             raise InputError(
-                f'[[vary]] key = "{parameter.key}": the bench has a geometry file, whose own alignment counts; vary'
-                " verify.true_geometry over several files instead"
+                f'[[vary]] key = "{parameter.key}": the bench has a geometry file, whose own'
+                " alignment counts; vary verify.true_geometry over several files instead"
             )
 
 

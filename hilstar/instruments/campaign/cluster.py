@@ -26,7 +26,10 @@ from hilstar.instruments.campaign.session import Answered, Identity, Job, Sessio
 _here = threading.local()
 INSTALL = "install it: pip install 'hilstar[dask]'"
 PROTOCOLS = ("tcp", "tls", "ucx")
-GIVE_TLS = "give tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, as Dask's scheduler and workers have them"
+GIVE_TLS = (
+    "give tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, as Dask's scheduler and"
+    " workers have them"
+)
 # seconds of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
 TASK_S = 1.0
 SPARE_TASKS = 1  # that wait at a worker beside those that its threads work on
@@ -99,11 +102,13 @@ class Scheduler:
                 )
         elif any(files):
             raise InputError(
-                f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write tls://HOST:PORT"
+                f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write"
+                " tls://HOST:PORT"
             )
         elif not endpoint.loopback:
             raise InputError(
-                f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use tcp://127.0.0.1:PORT"
+                f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use"
+                " tcp://127.0.0.1:PORT"
             )
         return f"{protocol}://{endpoint.address.removeprefix('tcp://')}"
 
@@ -187,7 +192,10 @@ class Cluster(Closing):
             ) from error
         except (OSError, TimeoutError) as error:
             if "certificate" in str(error):
-                why = "the scheduler and this side do not have certificates of one CA; look at --tls-ca-file and --tls-cert"
+                why = (
+                    "the scheduler and this side do not have certificates of one CA; look at"
+                    " --tls-ca-file and --tls-cert"
+                )
             else:
                 why = f"nothing answers there; start one: dask scheduler {self._dask_words()}"
             raise MachineError(f"--scheduler {address}: {why}") from error
@@ -197,8 +205,8 @@ class Cluster(Closing):
             with contextlib.suppress(InputError):
                 if not parse_endpoint(f"tcp://{listens.partition('://')[2]}").loopback:
                     self._say(
-                        f"hilstar: the scheduler listens at {listens} without TLS: who reaches that runs code on its workers;"
-                        f" start it with {self._dask_words()}"
+                        f"hilstar: the scheduler listens at {listens} without TLS: who reaches that"
+                        f" runs code on its workers; start it with {self._dask_words()}"
                     )
 
     def _dask_words(self) -> str:
@@ -248,7 +256,8 @@ class Cluster(Closing):
 
     def _gone(self) -> MachineError:
         return MachineError(
-            f"--scheduler {self._address}: answers no more; start it again, and run the same command: it goes on"
+            f"--scheduler {self._address}: answers no more; start it again, and run the same"
+            " command: it goes on"
         )
 
     def _bury(self, address: str, backlog: Backlog, lost: Lost) -> None:
@@ -305,7 +314,10 @@ class Cluster(Closing):
                 if future.status != "error":
                     del self._workers[address]
                     continue
-                why = f"cannot run campaigns of this hilstar ({type(error).__name__}: {error}); install the same version there"
+                why = (
+                    f"cannot run campaigns of this hilstar ({type(error).__name__}: {error});"
+                    " install the same version there"
+                )
             if why is not None:
                 self._refuse(address, why)
 
@@ -342,15 +354,20 @@ class Cluster(Closing):
             return
         now_s = time.monotonic()
         refused = f"; {len(self._workers)} are refused" if self._workers else ""
-        advice = f"start some: dask worker {self._address} --nthreads 1 --nworkers 8 {self._dask_words()}"
+        advice = (
+            f"start some: dask worker {self._address} --nthreads 1 --nworkers 8"
+            f" {self._dask_words()}"
+        )
         if self._alone_since_s is None:
             self._alone_since_s = now_s
             self._say(
-                f"hilstar: --scheduler {self._address} has no worker for this campaign{refused}; {advice}"
+                f"hilstar: --scheduler {self._address} has no worker for this campaign{refused};"
+                f" {advice}"
             )
         if now_s - self._alone_since_s > MAX_WITHOUT_WORKER_S:
             raise MachineError(
-                f"--scheduler {self._address}: no worker for this campaign in {MAX_WITHOUT_WORKER_S:g} s{refused}; {advice}"
+                f"--scheduler {self._address}: no worker for this campaign in"
+                f" {MAX_WITHOUT_WORKER_S:g} s{refused}; {advice}"
             )
 
     def close(self) -> None:

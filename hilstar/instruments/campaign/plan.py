@@ -268,11 +268,13 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         raise InputError('[attitudes] kind = "log" needs log = "FILE"; add it')
     if attitudes.kind != "field" and attitudes.radec_deg is not None:
         raise InputError(
-            f'[attitudes] radec_deg is for kind = "field", and kind is "{attitudes.kind}"; write that, or leave it out'
+            f'[attitudes] radec_deg is for kind = "field", and kind is "{attitudes.kind}"; write'
+            " that, or leave it out"
         )
     if attitudes.kind != "log" and attitudes.log is not None:
         raise InputError(
-            f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or leave it out'
+            f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or'
+            " leave it out"
         )
 
 
@@ -280,11 +282,13 @@ def _check_told(centroids: Centroiding) -> None:
     told = centroids.psf, centroids.psf_focus_um, centroids.psf_spectrum
     if centroids.centroider == "window" and told != (TRACKER_PSF, 0.0, "star"):
         raise InputError(
-            '[centroids] psf, psf_focus_um and psf_spectrum are for centroider = "psf"; write that, or leave them out'
+            '[centroids] psf, psf_focus_um and psf_spectrum are for centroider = "psf"; write that,'
+            " or leave them out"
         )
     if centroids.psf_focus_um and centroids.psf in (TRACKER_PSF, GAUSSIAN):
         raise InputError(
-            f'[centroids] psf_focus_um is for the file of psf, and psf is "{centroids.psf}"; leave it out'
+            f'[centroids] psf_focus_um is for the file of psf, and psf is "{centroids.psf}"; leave'
+            " it out"
         )
 
 
@@ -296,7 +300,8 @@ def _check_range(varied: Varied, sampling: Sampling) -> None:
     if varied.values is not None:
         if varied.steps is not None or varied.scale != "linear":
             raise InputError(
-                f"{where}: steps and scale are for minimum and maximum; leave them out beside values"
+                f"{where}: steps and scale are for minimum and maximum; leave them out beside"
+                " values"
             )
         return
     low, high = ends
@@ -308,7 +313,8 @@ def _check_range(varied: Varied, sampling: Sampling) -> None:
         raise InputError(f'{where}: minimum = {low:g} with scale = "log"; write a number above 0')
     if sampling == "grid" and varied.steps is None:
         raise InputError(
-            f'{where}: sampling = "grid" needs values, or steps beside minimum and maximum; add steps = 5'
+            f'{where}: sampling = "grid" needs values, or steps beside minimum and maximum; add'
+            " steps = 5"
         )
     if sampling != "grid" and varied.steps is not None:
         raise InputError(f'{where}: steps is for sampling = "grid"; leave it out')
@@ -355,8 +361,8 @@ def conditions_of(text: str) -> list[Condition]:
             match = None
         if match is None or (word is not None and comparison not in ("==", "!=")):
             raise InputError(
-                f'condition = "{shortened(text)}"; write such as "rate_deg_s.across <= 0.5": a key, one of <= < >= > == !=,'
-                ' a number, and " and " between several'
+                f'condition = "{shortened(text)}"; write such as "rate_deg_s.across <= 0.5": a key,'
+                ' one of <= < >= > == !=, a number, and " and " between several'
             )
         found.append(Condition(key, comparison, value))
     return found
@@ -377,8 +383,10 @@ def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]
                 or "none"
             )
             raise InputError(
-                f'[[require]] condition = "{shortened(text)}": {shortened(key)} is no key that the plan varies ({varied}),'
-                f" and no column of {'texts' if isinstance(value, str) else 'numbers'}; write one of those"
+                f'[[require]] condition = "{shortened(text)}": {shortened(key)} is no key that the'
+                f" plan varies ({varied}),"
+                f" and no column of {'texts' if isinstance(value, str) else 'numbers'}; write one"
+                " of those"
             )
         found.append(Condition(name, comparison, value))
     return found
@@ -549,7 +557,8 @@ class Design:
             if cases * self.dimensions > MAX_HYPERCUBE_VALUES:
                 most = MAX_HYPERCUBE_VALUES // self.dimensions
                 raise InputError(
-                    f"cases = {cases}: a Latin hypercube is made as a whole, of at most {most} cases with"
+                    f"cases = {cases}: a Latin hypercube is made as a whole, of at most {most}"
+                    " cases with"
                     f' {self.dimensions} dimensions; write sampling = "sobol"'
                 )
             from scipy.stats import qmc

@@ -197,8 +197,8 @@ class Pool:
             self._starts_lost += 1
             if self._starts_lost >= MAX_STARTS_LOST:
                 raise MachineError(
-                    f"{MAX_STARTS_LOST} workers died before they were ready (exit code {exit_code});"
-                    " is there enough memory? write --workers 1"
+                    f"{MAX_STARTS_LOST} workers died before they were ready (exit code"
+                    f" {exit_code}); is there enough memory? write --workers 1"
                 )
         if worker.task is not None:
             lost(worker.task, backlog.died(worker.task))

@@ -82,7 +82,10 @@ class RequirementVerdict:
                 if (self.verdict == NOT_MET) == (require.minimum is not None)
                 else "not less"
             )
-            said += f", {self.value:.4g} in {self.cases} cases, {side} than {self.bound:.4g} at {100 * require.confidence:g} %"
+            said += (
+                f", {self.value:.4g} in {self.cases} cases, {side} than {self.bound:.4g} at"
+                f" {100 * require.confidence:g} %"
+            )
         if self.verdict == NOT_SHOWN:
             said += (
                 f"; about {self.more} more cases would show it" if self.more else f"; {self.method}"
@@ -334,9 +337,9 @@ def quantile_limits(values: FloatArray, share: float, confidence: float) -> tupl
     upper = int(stats.binom.ppf(confidence, n, share))
     lower = int(stats.binom.ppf(1 - confidence, n, share))
     lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
-    return float(ordered[lower - 1]) if lower > 0 else -math.inf, float(
-        ordered[upper]
-    ) if upper < n else math.inf
+    return float(ordered[lower - 1]) if lower > 0 else -math.inf, (
+        float(ordered[upper]) if upper < n else math.inf
+    )
 
 
 def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> _Figure:

@@ -82,7 +82,10 @@ def write_requirements(
     ]
     each_count = ", ".join(f"{count} {verdict}" for verdict, count in counts if count)
     page = [
-        f"<p>{_badge(verdict_of(found))} {escaped(f'Of {len(found)} requirements {each_count}.')}</p>",
+        (
+            f"<p>{_badge(verdict_of(found))}"
+            f" {escaped(f'Of {len(found)} requirements {each_count}.')}</p>"
+        ),
         table_of(about),
         "<h2>Verdicts</h2>",
         table_of(
@@ -96,18 +99,23 @@ def write_requirements(
                         each.cases,
                     ),
                     Markup(_badge(each.verdict)),
-                    f"about {each.more} more cases"
-                    if each.verdict == NOT_SHOWN and each.more
-                    else "",
+                    (
+                        f"about {each.more} more cases"
+                        if each.verdict == NOT_SHOWN and each.more
+                        else ""
+                    ),
                     each.method,
                 )
                 for each in found
             ],
             ("requirement", "confidence", "measured", "bound", "cases", "verdict", "", "method"),
         ),
-        "<p>The bound is what the cases support at the stated confidence, one-sided. Met: the bound keeps the limit. Not met:"
-        " the bound on the limit's other side breaks it. Not shown: the cases decide neither. Quantities are those of"
-        " ECSS-E-ST-60-20C; errors are one sigma an axis, arcsec, camera axes; times in seconds.</p>",
+        (
+            "<p>The bound is what the cases support at the stated confidence, one-sided. Met: the"
+            " bound keeps the limit. Not met: the bound on the limit's other side breaks it. Not"
+            " shown: the cases decide neither. Quantities are those of ECSS-E-ST-60-20C; errors are"
+            " one sigma an axis, arcsec, camera axes; times in seconds.</p>"
+        ),
         "<h2>Error against rate</h2>",
         picture_of(
             svg(figure).encode(),
@@ -146,7 +154,10 @@ def verdict_of(found: list[RequirementVerdict]) -> str:
 
 
 def _badge(verdict: str) -> str:
-    return f'<span class="verdict" style="white-space:nowrap;background:{COLOURS[verdict]}">{verdict}</span>'
+    return (
+        '<span class="verdict"'
+        f' style="white-space:nowrap;background:{COLOURS[verdict]}">{verdict}</span>'
+    )
 
 
 def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
@@ -163,7 +174,10 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
         if each.require.quantity in DRAWN and (each.require.axis or "cross") in ("cross", "x", "y")
     ]
     counts = f"{sum(each.verdict == MET for each in found)} of {len(found)} requirements are met"
-    note = "Dots: cases about the median. Line: one sigma of each bin. Horizontal: one sigma that a requirement allows."
+    note = (
+        "Dots: cases about the median. Line: one sigma of each bin. Horizontal: one sigma that a"
+        " requirement allows."
+    )
     with panels_of(counts, 1, note=note) as (axes,):
         if len(known):
             some = known[np.unique(np.linspace(0, len(known) - 1, MAX_POINTS).astype(int))]

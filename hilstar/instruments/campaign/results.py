@@ -112,7 +112,8 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
         )
     except (OSError, pa.ArrowException, ValueError) as error:
         raise InputError(
-            f"{path}: is no table of a campaign ({error}); delete it, and run the same command again"
+            f"{path}: is no table of a campaign ({error}); delete it, and run the same command"
+            " again"
         ) from error
 
 
@@ -303,9 +304,11 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
         level=levels,
         error=errors,
         overall=_level(y, measure.mean)[0],
-        cost=float(levels.mean() - levels[best])
-        if measure.mean
-        else math.sqrt(float((levels**2).mean() - levels[best] ** 2)),
+        cost=(
+            float(levels.mean() - levels[best])
+            if measure.mean
+            else math.sqrt(float((levels**2).mean() - levels[best] ** 2))
+        ),
         share=_share(y, index, len(places)),
         sure=float(levels[worst] - levels[best])
         > SURE * math.hypot(float(errors[best]), float(errors[worst])),
@@ -358,11 +361,17 @@ def finding(found: list[Cost]) -> str:
     """The parameter that costs most of a measure, in one line."""
     first, what = found[0], WORDS[found[0].measure]
     if not first.sure:
-        return f"No parameter changes the {what} beyond these cases' noise: {_figure(first.overall, first)} in the median"
+        return (
+            f"No parameter changes the {what} beyond these cases' noise:"
+            f" {_figure(first.overall, first)} in the median"
+        )
 
     def at(k: int) -> str:
         place = first.places[k]
-        return f"{_figure(float(first.level[k]), first)} at {place if isinstance(place, str) else f'{place:.3g}'}"
+        return (
+            f"{_figure(float(first.level[k]), first)} at"
+            f" {place if isinstance(place, str) else f'{place:.3g}'}"
+        )
 
     return f"{first.parameter} costs the most of the {what}: {at(first.best)}, {at(first.worst)}"
 
@@ -466,11 +475,13 @@ def lines_of(summary: dict[str, Any]) -> list[str]:
         for line, count in list(summary["failed_because"].items())[:MAX_REASONS]
     ]
     lines.append(
-        f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong answers"
+        f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong"
+        " answers"
     )
     if summary["bias_arcsec"] is not None:
         lines.append(
-            f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary['bias_arcsec'])} arcsec about x, y, z"
+            f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary['bias_arcsec'])} arcsec"
+            " about x, y, z"
         )
         for part, name in (*PARTS.items(), ("scatter", SCATTER)):
             axes: Axes | None = summary[f"{part}_arcsec"]
@@ -484,7 +495,8 @@ def lines_of(summary: dict[str, Any]) -> list[str]:
     if found is not None:
         lines.append(
             f"{'centroids':20}{found['sigma_x_px']:.3g}, {found['sigma_y_px']:.3g} px one sigma,"
-            f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g} false a frame"
+            f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g}"
+            " false a frame"
         )
     lines.append(f"{'limit of its stars':20}{limit_text(summary['limit_arcsec'])}")
     return [*lines, *summary["notes"], *summary["findings"]]

@@ -87,8 +87,8 @@ class Campaign:
             ) from error
         if self.on_bench and self.file.config.answers is None:
             raise InputError(
-                f'{path}: through = "bench" needs the tracker\'s answers; write [answers] with source = "serial" or the like in'
-                f" {self.file.path}"
+                f'{path}: through = "bench" needs the tracker\'s answers; write [answers] with'
+                f' source = "serial" or the like in {self.file.path}'
             )
         for require in self.plan.require:
             checked_conditions(require.condition, self.columns)
@@ -209,9 +209,9 @@ class Campaign:
 
     def _write(self, directory: Directory, blocks: Iterator[list[Row]]) -> None:
         about = {
-            f"hilstar.{name}": value
-            if isinstance(value, str)
-            else msgspec.json.encode(value).decode()
+            f"hilstar.{name}": (
+                value if isinstance(value, str) else msgspec.json.encode(value).decode()
+            )
             for name, value in msgspec.to_builtins(self.about()).items()
         }
         write_table(directory.table, schema_of(self.columns, about), blocks)

@@ -57,10 +57,16 @@ class Identity(msgspec.Struct, frozen=True):
 
 WORDS = {
     "hilstar": "hilstar {0}, and the campaign is of {1}; install that version there",
-    "code_sha256": "hilstar's code {0:.12} under the same version, and the campaign is of {1:.12}; install the same there",
+    "code_sha256": (
+        "hilstar's code {0:.12} under the same version, and the campaign is of {1:.12}; install the"
+        " same there"
+    ),
     "numpy": "NumPy {0}, and the campaign is of {1}; install that version there",
     "scipy": "SciPy {0}, and the campaign is of {1}; install that version there",
-    "gl_renderer": "the renderer {0}, and the campaign is of {1}: frames differ in their last bits; use machines of one kind",
+    "gl_renderer": (
+        "the renderer {0}, and the campaign is of {1}: frames differ in their last bits; use"
+        " machines of one kind"
+    ),
 }
 
 
@@ -135,12 +141,13 @@ class Session:
         self.file = bench_file_of(Path(job.bench_path), job.bench_text)
         if self.file.sha256 != job.bench_sha256:
             raise InputError(
-                f"its bench {self.file.sha256:.12} is not the campaign's {job.bench_sha256:.12}: a file that {job.bench_path}"
-                " names has another content there; copy it"
+                f"its bench {self.file.sha256:.12} is not the campaign's {job.bench_sha256:.12}: a"
+                f" file that {job.bench_path} names has another content there; copy it"
             )
         if files_sha256(self.plan, Path(job.plan_path).parent) != job.files_sha256:
             raise InputError(
-                f"its log or scenario is not the campaign's: a file that {job.plan_path} names differs there; copy it"
+                f"its log or scenario is not the campaign's: a file that {job.plan_path} names"
+                " differs there; copy it"
             )
         self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
         self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)

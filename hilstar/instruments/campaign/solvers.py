@@ -131,7 +131,8 @@ class CentroidSolver:
         wanted, psf, detector = self._wanted, tracker.canvas.psf, tracker.config.tracker.detector
         if wanted.centroider == "psf" and detector.bayer is not None:
             raise InputError(
-                '[centroids] centroider = "psf": pixels of a mosaic have a PSF each; leave it out, or bayer'
+                '[centroids] centroider = "psf": pixels of a mosaic have a PSF each; leave it out,'
+                " or bayer"
             )
         width_px = software_psf_px(psf.width_px, detector)
         settings = CentroidSettings(
@@ -322,7 +323,8 @@ class CommandSolver:
             ) from error
         if not any(IMAGE in word or PICTURE in word for word in self._words):
             raise InputError(
-                f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write centroids,"
+                f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write"
+                " centroids,"
                 f' python:MODULE:FUNCTION, or a command with {IMAGE} in it, such as "solve {IMAGE}"'
             )
         self._folder, self._timeout_s = folder, timeout_s
@@ -362,7 +364,8 @@ class CommandSolver:
                 if child.too_much:
                     most = f"{MAX_OUTPUT_BYTES // 1_000_000} MB"
                     raise SolverFault(
-                        f"the solver printed more than {most} and was ended; let it print the quaternion alone"
+                        f"the solver printed more than {most} and was ended; let it print the"
+                        " quaternion alone"
                     )
                 if code is None:
                     raise SolverFault(f"the solver took longer than {self._timeout_s:g} s")

@@ -102,7 +102,8 @@ def failures(path: Path) -> dict[str, int]:
                     because[row["why"]] = because.get(row["why"], 0) + 1
     except (OSError, pa.ArrowException, KeyError) as error:
         raise InputError(
-            f"{path}: is no table of a campaign ({error}); delete it, and run the same command again"
+            f"{path}: is no table of a campaign ({error}); delete it, and run the same command"
+            " again"
         ) from error
     return because
 
@@ -170,7 +171,8 @@ class Journal:
         found = self._read(self._path(block, FULL))[0]
         if len(found) != len(self._block(block)):
             raise InputError(
-                f"{self._path(block, FULL)}: rows of cases are missing in it; delete it, and run the same command again"
+                f"{self._path(block, FULL)}: rows of cases are missing in it; delete it, and run"
+                " the same command again"
             )
         return [found[case] for case in sorted(found)]
 
@@ -307,7 +309,8 @@ class Directory:
             for name in (TABLE, JOURNAL):
                 if (self.path / name).exists():
                     raise InputError(
-                        f"{self.path / name}: is there already, and no {ABOUT} says whose it is; {ANOTHER}"
+                        f"{self.path / name}: is there already, and no {ABOUT} says whose it is;"
+                        f" {ANOTHER}"
                     )
             write_whole(place, msgspec.json.format(msgspec.json.encode(about), indent=1))
             return

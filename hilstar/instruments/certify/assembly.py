@@ -211,35 +211,76 @@ def _of_readings(
     white = math.sqrt(read.even.found.noise_variance) / fit.noise if read.even.found.total else 1.0
     found = [
         Effect(
-            Input("response", "Student t", "patches of light", light.factors.shape[1], light.noise, "relative", light.dof),
+            Input(
+                "response",
+                "Student t",
+                "patches of light",
+                light.factors.shape[1],
+                light.noise,
+                "relative",
+                light.dof,
+            ),
             levels=(join @ light.factors).T,
         ),
         Effect(
-            Input("dark readings", "Student t", "scatter of black", len(dark), light.dark, "of white", light.dark_dof),
+            Input(
+                "dark readings",
+                "Student t",
+                "scatter of black",
+                len(dark),
+                light.dark,
+                "of white",
+                light.dark_dof,
+            ),
             levels=dark,
         ),
         Effect(
-            Input("form of the response", "triangular", "a spline, or straight between codes", 1, _rms(bent), "relative"),
+            Input(
+                "form of the response",
+                "triangular",
+                "a spline, or straight between codes",
+                1,
+                _rms(bent),
+                "relative",
+            ),
             levels=bent[None],
         ),
         Effect(
-            Input("evenness", "Student t", "light of dots", even.shape[1], white * fit.noise, "relative", fit.dof),
+            Input(
+                "evenness",
+                "Student t",
+                "light of dots",
+                even.shape[1],
+                white * fit.noise,
+                "relative",
+                fit.dof,
+            ),
             even=white * (even @ fit.factors).T,
         ),
         Effect(
             Input(
-                "form of the light map", "rectangular", "smooth, or linear between a map's places", 1, _rms(half), "relative"
+                "form of the light map",
+                "rectangular",
+                "smooth, or linear between a map's places",
+                1,
+                _rms(half),
+                "relative",
             ),
             even=half[None],
         ),
         Effect(
             Input(
-                "geometry", "Student t", "places of dots", len(place.noise), math.sqrt(place.found.noise_variance), "arcsec",
+                "geometry",
+                "Student t",
+                "places of dots",
+                len(place.noise),
+                math.sqrt(place.found.noise_variance),
+                "arcsec",
                 place.noise_dof,
             ),
             place=place.noise,
         ),
-    ]  # fmt: skip
+    ]
     found += _of_structure(figures, read, lasting, rough)
     if len(late_ms) > 1:
         found += _of_delays(late_ms)
@@ -446,7 +487,8 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
     error = None if name is None else load_notes(file.folder / name).error
     if error is None or (error.map_arcsec is None and error.alignment_covariance_arcsec2 is None):
         missing.append(
-            "place and attitude: [collimator] geometry names no file with its errors (hilstar calibrate geometric)"
+            "place and attitude: [collimator] geometry names no file with its errors (hilstar"
+            " calibrate geometric)"
         )
         return
     wide, high = file.config.monitor.resolution_px
@@ -515,7 +557,8 @@ def _of_warm_up(
         seen, source = known / 100, "[certify] warm_up_percent"
     if seen is None:
         missing.append(
-            "warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is not written"
+            "warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is"
+            " not written"
         )
     else:
         u = seen / math.sqrt(3)
@@ -561,11 +604,15 @@ def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
     one, instrument = np.ones((1, stars)), certify.instrument
     if instrument.name:
         scale = instrument.relative_expanded / instrument.k
-        source = f"certificate of {instrument.name}{f', {instrument.date}' if instrument.date else ''}, k = {instrument.k:g}"
+        source = (
+            f"certificate of {instrument.name}{f', {instrument.date}' if instrument.date else ''},"
+            f" k = {instrument.k:g}"
+        )
         yield Effect(Input("instrument", "normal", source, 1, scale, "relative"), even=scale * one)
     else:
         missing.append(
-            "absolute scale of the light: no [certify.instrument]; light is in the tracker's own electrons"
+            "absolute scale of the light: no [certify.instrument]; light is in the tracker's own"
+            " electrons"
         )
     yield from _of_tracker(file, figures, missing)
     if certify.temperature_k and (certify.flux_mag_per_k or certify.place_arcsec_per_k):
@@ -611,8 +658,9 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
     smooth = (vectors * np.sqrt(np.maximum(size, 0.0))).T
     if (direction := stated.direction_expanded_arcsec) is None:
         missing.append(
-            "place and attitude: they are seen through the tracker's own lens, taken as [tracker] has it, and how well that is"
-            " known is not written ([certify.tracker] direction_expanded_arcsec)"
+            "place and attitude: they are seen through the tracker's own lens, taken as [tracker]"
+            " has it, and how well that is known is not written ([certify.tracker]"
+            " direction_expanded_arcsec)"
         )
     elif direction:
         place = np.zeros((2, len(at), count, 2))
@@ -623,8 +671,8 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
         yield Effect(lens, place=place.reshape(-1, count, 2))
     if (even := stated.evenness_expanded_relative) is None:
         missing.append(
-            "vignetting: light over the field is as the tracker itself collects it, which counts as the screen's"
-            " ([certify.tracker] evenness_expanded_relative is not written)"
+            "vignetting: light over the field is as the tracker itself collects it, which counts as"
+            " the screen's ([certify.tracker] evenness_expanded_relative is not written)"
         )
     elif even:
         # Relative to the middle two places are off by a half each, in variance, where they are far
@@ -636,8 +684,8 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
         yield Effect(vignetting, even=from_middle)
     if (linear := stated.linearity_expanded_relative) is None:
         missing.append(
-            "linearity: light is in the scale of what reads it, taken as linear ([certify.tracker] linearity_expanded_relative"
-            " is not written)"
+            "linearity: light is in the scale of what reads it, taken as linear ([certify.tracker]"
+            " linearity_expanded_relative is not written)"
         )
     elif linear:
         scale = Input("tracker's linearity", "normal", source, 1, linear / stated.k, "relative")
@@ -701,9 +749,10 @@ def spectrum_mag(file: BenchFile, b_v_mag: FloatArray) -> tuple[FloatArray, str]
     its source.
     """
     if file.config.sky.spectrum != "blackbody" or file.config.sky.brightness != "dgs":
-        return np.full(
-            len(b_v_mag), LIBRARY_MAG
-        ), "real stars of one colour (study tradeoff: 0.026 mag at 95 %)"
+        return (
+            np.full(len(b_v_mag), LIBRARY_MAG),
+            "real stars of one colour (study tradeoff: 0.026 mag at 95 %)",
+        )
     rates = []
     known = np.nan_to_num(b_v_mag, nan=0.65)
     for spectrum in ("pickles", "blackbody"):
@@ -714,6 +763,7 @@ def spectrum_mag(file: BenchFile, b_v_mag: FloatArray) -> tuple[FloatArray, str]
                 axis=1
             )
         )
-    return np.abs(
-        magnitude(rates[0] / rates[1])
-    ), "black bodies against library spectra of the same B-V"
+    return (
+        np.abs(magnitude(rates[0] / rates[1])),
+        "black bodies against library spectra of the same B-V",
+    )

@@ -157,7 +157,10 @@ def why_they_differ(
     largest = inputs[int(np.argmax(share))]
     middle = (drawn.upper[number] + drawn.lower[number]) / 2 - combined.value[number]
     if abs(middle) > DIFFER * half:
-        return "the model is not linear over the inputs' range: its interval is not even about the value"
+        return (
+            "the model is not linear over the inputs' range: its interval is not even about the"
+            " value"
+        )
     if largest.distribution in ("rectangular", "triangular") and share.max() > 0.5:
         return (
             f"the largest input ({largest.name}) is {largest.distribution}, whose tails are short"

@@ -43,14 +43,24 @@ MAX_FILE_BYTES = 500_000_000
 SEED = 11
 DIGITS = 6
 MEASURANDS = {
-    "flux": "light that the star's codes make at its place, over what the bench file says they make, mag (fainter > 0)",
-    "place_along": "direction in which the star is shown, less the one commanded, along the image's x, arcsec",
+    "flux": (
+        "light that the star's codes make at its place, over what the bench file says they make,"
+        " mag (fainter > 0)"
+    ),
+    "place_along": (
+        "direction in which the star is shown, less the one commanded, along the image's x, arcsec"
+    ),
     "place_across": "the same along the image's y, arcsec",
-    "attitude_x": "rotation vector from the commanded to the reported attitude by the field's stars, about cam x, arcsec",
+    "attitude_x": (
+        "rotation vector from the commanded to the reported attitude by the field's stars, about"
+        " cam x, arcsec"
+    ),
     "attitude_y": "the same about cam y, arcsec",
     "attitude_z": "the same about the boresight, arcsec",
     "latency": "from the buffer swap to the light of the first row, ms",
-    "star_flux": "flux, with what the codes lose, and the errors of the catalogue and of the spectrum, mag",
+    "star_flux": (
+        "flux, with what the codes lose, and the errors of the catalogue and of the spectrum, mag"
+    ),
     "star_place_along": "place_along, with the catalogue's error, arcsec",
     "star_place_across": "place_across, with the catalogue's error, arcsec",
 }
@@ -213,12 +223,14 @@ def _figures(
                 unit=unit,
                 dof=round(dof, 1) if dof < MAX_DOF else None,
                 limit=limit,
-                conforms=None
-                if limit is None
-                else all(abs(end - nominal) <= limit for end in ends),
-                truth=_rounded(float(truth[number]))
-                if truth is not None and number < len(truth)
-                else None,
+                conforms=(
+                    None if limit is None else all(abs(end - nominal) <= limit for end in ends)
+                ),
+                truth=(
+                    _rounded(float(truth[number]))
+                    if truth is not None and number < len(truth)
+                    else None
+                ),
                 by_trials=ByTrials(
                     standard_uncertainty=_rounded(float(drawn.standard[number])),
                     lower=_rounded(float(drawn.lower[number])),

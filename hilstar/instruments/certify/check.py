@@ -138,7 +138,8 @@ def read_reference(path: Path) -> CheckReadings | None:
         return msgspec.json.decode(read_bytes(path, "", MAX_BYTES), type=CheckReadings)
     except NOT_JSON as error:
         raise InputError(
-            f"{path}: has no readings of a certificate ({shortened(error)}); certify the bench --again"
+            f"{path}: has no readings of a certificate ({shortened(error)}); certify the bench"
+            " --again"
         ) from error
 
 
@@ -279,7 +280,8 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
         dots.append(DotReadings(x, y, seen_x, seen_y, light_of))
     if len(both) < 4 * len(TOLERANCES):
         raise InputError(
-            f"{len(both)} dots are seen now and were then; look at focus, exposure and what covers the screen"
+            f"{len(both)} dots are seen now and were then; look at focus, exposure and what covers"
+            " the screen"
         )
     size = file.config.monitor.resolution_px
     moved = place_errors(file, dots[1]) - place_errors(file, dots[0])

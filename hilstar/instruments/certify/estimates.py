@@ -140,7 +140,8 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     dof = len(read.code) - len(codes) - timed
     if len(codes) <= MIN_LEVELS or codes[0] != 0 or dof < MIN_DOF:
         raise InputError(
-            f"{len(read.code)} readings of {len(codes)} codes; read black and {MIN_LEVELS} codes or more, some of them again"
+            f"{len(read.code)} readings of {len(codes)} codes; read black and {MIN_LEVELS} codes or"
+            " more, some of them again"
         )
     mean = np.bincount(place, read.light) / count
     design = np.zeros((len(read.code), len(codes) + timed))
@@ -170,7 +171,8 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         floor = math.sqrt(float((left[dark] ** 2).sum()) / max(float(own[dark].sum()), 1e-9))
     if own[bright].sum() < MIN_DOF / 2 or own[dark].sum() < MIN_DOF / 2:
         raise InputError(
-            "white and black are read too seldom to know their scatter; read both three times or more"
+            "white and black are read too seldom to know their scatter; read both three times or"
+            " more"
         )
     by_light, by_dark = (
         inverse * part / sigma for part in (noise * by_shape, np.full(len(lit), floor))
@@ -305,7 +307,8 @@ def surface(
     if best is None:
         needed = DOTS_A_TERM * (degrees[0] + 1) * (degrees[0] + 2) // 2
         raise InputError(
-            f"{int(kept.sum())} dots are seen and {needed} are needed; look at focus, exposure and [collimator]"
+            f"{int(kept.sum())} dots are seen and {needed} are needed; look at focus, exposure and"
+            " [collimator]"
         )
     return best
 

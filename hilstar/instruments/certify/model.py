@@ -75,7 +75,8 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
                 break
     if not stars:
         raise InputError(
-            f"{file.path}: no {MIN_STARS} stars stand alone in a reference field; write a fainter [sky]"
+            f"{file.path}: no {MIN_STARS} stars stand alone in a reference field; write a fainter"
+            " [sky]"
         )
     return stars
 

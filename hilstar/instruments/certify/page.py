@@ -15,9 +15,12 @@ from hilstar.basics.html_pages import Markup, drawing_of, escaped, page_of, tabl
 from hilstar.instruments.certify.model import THIRDS
 from hilstar.server.bench.certificate import Certificate, CertifiedFigure
 
-PRINTED = """<style>@page { size: A4; margin: 16mm } @media print { body { margin: 0; max-width: none; font-size: 11px }
-details { display: block } details > * { display: block } h2 { break-after: avoid } tr, img, p { break-inside: avoid } }
-.banner { border-left: .5rem solid; padding: .5rem 1rem; margin: 1rem 0; font-size: 1.1em }</style>"""
+PRINTED = """<style>@page { size: A4; margin: 16mm } @media print {
+body { margin: 0; max-width: none; font-size: 11px }
+details { display: block } details > * { display: block } h2 { break-after: avoid }
+tr, img, p { break-inside: avoid } }
+.banner { border-left: .5rem solid; padding: .5rem 1rem; margin: 1rem 0; font-size: 1.1em }
+</style>"""
 VERDICTS = {
     True: ("#2e7d32", "Conforms"),
     False: ("#c62828", "Does not conform"),
@@ -28,7 +31,10 @@ BARS = ("flux", "place_along", "attitude_x", "star_flux")
 MAX_BARS = 6
 RULES = {
     "guard-band": "guard band: a figure conforms where its whole 95 % interval is within its limit",
-    "simple": "simple acceptance: a figure conforms where its value is within its limit, whatever its uncertainty",
+    "simple": (
+        "simple acceptance: a figure conforms where its value is within its limit, whatever its"
+        " uncertainty"
+    ),
 }
 
 
@@ -45,9 +51,15 @@ def write_certificate_page(path: Path, found: Certificate, digest: str) -> None:
     )
     body = [
         PRINTED,
-        f'<p class="banner" style="border-color:{colour}"><b>{verdict}{why}</b>. {escaped(statement(found))}</p>',
+        (
+            f'<p class="banner" style="border-color:{colour}"><b>{verdict}{why}</b>.'
+            f" {escaped(statement(found))}</p>"
+        ),
         table_of(_heads(found, digest)),
-        "<h2>Figures</h2><p>Worst of each kind and region: value and 95 % interval (coverage factor k by Student's t).</p>",
+        (
+            "<h2>Figures</h2><p>Worst of each kind and region: value and 95 % interval (coverage"
+            " factor k by Student's t).</p>"
+        ),
         table_of(
             list(_worst(found)),
             ("quantity", "region", "value", "from", "to", "unit", "k", "dof", "limit", "verdict"),
@@ -116,7 +128,10 @@ def statement(found: Certificate) -> str:
             parts.append(f"{words} {np.sqrt(np.mean(np.square(half))):.2g} {unit}")
     late = next((each for each in found.figures if each.quantity == "latency"), None)
     parts += [f"latency {(late.upper - late.lower) / 2:.2g} ms"] if late else []
-    return f"Expanded uncertainty (95 %), rms over the reference stars: {', '.join(parts) or 'nothing could be stated'}."
+    return (
+        "Expanded uncertainty (95 %), rms over the reference stars:"
+        f" {', '.join(parts) or 'nothing could be stated'}."
+    )
 
 
 def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, ...]]:
@@ -130,7 +145,10 @@ def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, ...]]:
         of = found.instrument
         yield (
             "instrument",
-            f"{of['name']}, {of['date']}: U = {of['relative_expanded']:.3g} relative, k = {of['k']:g}",
+            (
+                f"{of['name']}, {of['date']}: U = {of['relative_expanded']:.3g} relative, k ="
+                f" {of['k']:g}"
+            ),
         )
     yield "decision rule", RULES[found.decision]
     if found.replaces:
@@ -180,7 +198,10 @@ def _bars(found: Certificate, quantity: str) -> str:
     if not ranked:
         return ""
     total, unit = np.sqrt(sum(squares.values())), members[0].unit
-    finding = f"{quantity}: {total:.2g} {unit} standard uncertainty, of which {ranked[0][0]} {np.sqrt(ranked[0][1]):.2g}"
+    finding = (
+        f"{quantity}: {total:.2g} {unit} standard uncertainty, of which {ranked[0][0]}"
+        f" {np.sqrt(ranked[0][1]):.2g}"
+    )
     with panels_of(finding, height_inch=1.1 + 0.3 * len(ranked)) as (axes,):
         colours = [BLUE if k == 0 else TEAL for k in range(len(ranked))]
         value_bars(
@@ -213,17 +234,21 @@ def _both_ways(found: Certificate) -> Iterator[str]:
         else "the largest number of trials was reached"
     )
     yield (
-        f"<p>{found.trials} trials of the whole model ({stand}): their standard uncertainty is {ratio.min():.3f} to"
-        f" {ratio.max():.3f} of first order's.</p>"
+        f"<p>{found.trials} trials of the whole model ({stand}): their standard uncertainty is"
+        f" {ratio.min():.3f} to {ratio.max():.3f} of first order's.</p>"
     )
     apart = [each for each in both if each.by_trials and each.by_trials.differs]
     rows = [
-        (e.quantity, e.star or e.region, e.value - e.k * e.standard_uncertainty, e.value + e.k * e.standard_uncertainty,
+        (e.quantity, e.star or e.region,
+         e.value - e.k * e.standard_uncertainty, e.value + e.k * e.standard_uncertainty,
          e.by_trials.lower, e.by_trials.upper, e.by_trials.differs)
         for e in apart[:20] if e.by_trials
     ]  # fmt: skip
     if rows:
-        yield f"<p>{len(apart)} figures differ by more than 5 % of the interval; the certificate states the trials'.</p>"
+        yield (
+            f"<p>{len(apart)} figures differ by more than 5 % of the interval; the certificate"
+            " states the trials'.</p>"
+        )
         yield table_of(
             rows, ("quantity", "of", "first order from", "to", "trials from", "to", "why")
         )

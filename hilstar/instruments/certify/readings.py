@@ -116,7 +116,8 @@ def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
         kept &= (at_y > EDGE_TRACKER_PX) & (at_y < high - 1 - EDGE_TRACKER_PX)
     if kept.sum() < MIN_DOTS:
         raise InputError(
-            f"the tracker sees {int(kept.sum())} dots of the screen and {MIN_DOTS} are needed; look at [collimator]"
+            f"the tracker sees {int(kept.sum())} dots of the screen and {MIN_DOTS} are needed; look"
+            " at [collimator]"
         )
     return x[kept], y[kept]
 
@@ -145,7 +146,8 @@ class VirtualReader:
         image_sources.refuse_other_bench(file, truth)
         if orientation_of(file.config.monitor) != orientation_of(truth.config.monitor):
             raise InputError(
-                f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar first-light)"
+                f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar"
+                " first-light)"
             )
         self.file, self.truth, self._rng = file, truth, np.random.default_rng((seed, 0xCE27, turn))
         self.identity = f"virtual: {truth.path.name}, sha256 {truth.sha256}, seed {seed}"
@@ -300,7 +302,8 @@ class ImageReader:
         expected = np.stack(geometry.to_tracker(x, y), axis=1)
         if len(found) < MIN_DOTS:
             raise InputError(
-                f"{len(found)} dots are in the image and {MIN_DOTS} are needed; look at the focus and the exposure"
+                f"{len(found)} dots are in the image and {MIN_DOTS} are needed; look at the focus"
+                " and the exposure"
             )
         far, near = (
             np.asarray(part)
@@ -309,7 +312,8 @@ class ImageReader:
         kept = (far < APART_TRACKER_PX / 2) & ~found.at_edge[near]
         if kept.sum() < MIN_DOTS:
             raise InputError(
-                f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)"
+                f"{int(kept.sum())} dots are where the bench file has them; run the geometry again"
+                " (first-light)"
             )
         seen = SeenScreen(
             geometry.monitor,

@@ -104,6 +104,7 @@ def _image(sky: Sky) -> FloatArray:
     )
     if image.dtype.kind != "f":
         raise InputError(
-            f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float), not its codes"
+            f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float),"
+            " not its codes"
         )
     return np.asarray(image, dtype=np.float64)

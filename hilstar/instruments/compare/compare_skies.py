@@ -102,16 +102,19 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
     for name, image in (("frame", frame), ("golden", golden)):
         if not (image.ndim == 2 or image.shape[:-2] == (len(CHANNELS),)) or min(image.shape) < 2:
             raise InputError(
-                f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)"
+                f"compare: the {name} image has the shape {image.shape}; give a linear image"
+                " (height, width)"
             )
         if not np.isfinite(image).all():
             raise InputError(
-                f"compare: the {name} image has a pixel that is NaN or infinite; give finite numbers"
+                f"compare: the {name} image has a pixel that is NaN or infinite; give finite"
+                " numbers"
             )
     if frame.shape != golden.shape:
         (height, width), (golden_height, golden_width) = frame.shape[-2:], golden.shape[-2:]
         raise InputError(
-            f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give images of one monitor"
+            f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give"
+            " images of one monitor"
         )
     if not (golden > 0).any():
         raise InputError("compare: the golden image has no star; give one that has")

@@ -480,7 +480,10 @@ def finding(comparison: SkyComparison) -> str:
         return f"In channel {other}: {finding(comparison.channels[other])}"
     if comparison.same:
         largest = comparison.flux_error_mag.max, comparison.centroid_error_px.max
-        return f"The same sky: {comparison.star_count} stars, at most {largest[0]:.2g} mag and {largest[1]:.2g} px off"
+        return (
+            f"The same sky: {comparison.star_count} stars, at most {largest[0]:.2g} mag and"
+            f" {largest[1]:.2g} px off"
+        )
     if comparison.common is not None:
         odd = comparison.differing[:1]
         return f"Not the same sky: {comparison.common.line()}" + "".join(
@@ -488,4 +491,7 @@ def finding(comparison: SkyComparison) -> str:
         )
     counts = {name: len(comparison.of(name)) for name in ("changed", "missing", "extra")}
     rest = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    return f"Not the same sky: of {comparison.star_count} stars {rest}; the worst is {comparison.bad[0].line()}"
+    return (
+        f"Not the same sky: of {comparison.star_count} stars {rest}; the worst is"
+        f" {comparison.bad[0].line()}"
+    )

@@ -317,7 +317,8 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
     blend_px = blend_distance_px(psf)
     if not _has(truth, found, blend_px):
         raise InputError(
-            "compare: the truth table's stars are not where the golden image has them; give the table of that frame"
+            "compare: the truth table's stars are not where the golden image has them; give the"
+            " table of that frame"
         )
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
     places = _places_px(table)

@@ -58,7 +58,8 @@ class FixedPattern:
             times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
             found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}" if rms else ""
             said.append(
-                f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'} {unit}"
+                f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'}"
+                f" {unit}"
             )
         return ", ".join(said)
 

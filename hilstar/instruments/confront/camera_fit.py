@@ -449,8 +449,9 @@ def _largest(
         folding_px = min(folding_px, floor)
     if folding_px < FOLDED * floor:
         raise InputError(
-            "the stars ask for a distortion that folds within the image: two directions share a pixel near its corners; give"
-            " frames that are cut to the middle ([tracker] resolution_px with them), or of a longer focal length"
+            "the stars ask for a distortion that folds within the image: two directions share a"
+            " pixel near its corners; give frames that are cut to the middle ([tracker]"
+            " resolution_px with them), or of a longer focal length"
         )
     return name, camera, turned, floor
 

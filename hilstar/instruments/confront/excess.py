@@ -79,13 +79,15 @@ def split_excess(session: Session, verdicts: Sequence[Verdict]) -> Excess | None
         Part(
             "place within the pixel",
             math.sqrt(sum(_taken(phases, off[:, k]) for k in (0, 1)) / 2),
-            "what repeats with the place in the pixel: the model of the PSF, and the pixel's own response",
+            "what repeats with the place in the pixel: the model of the PSF, and the pixel's own"
+            " response",
         ),
         Part("pixel response", _response(session)[1], "as in the light: it moves a star's centre"),
         Part(
             "colour",
             math.sqrt(sum(_taken(columns[k], off[:, k]) for k in (0, 1)) / 2),
-            "what goes with B-V and with B-V times the radius: lateral colour, the air's dispersion",
+            "what goes with B-V and with B-V times the radius: lateral colour, the air's"
+            " dispersion",
         ),
     ]
     places = (*parts, _rest(whole, parts))
@@ -132,7 +134,8 @@ def _light(
         Part(
             "pixel response",
             MAG * _response(session)[0],
-            "the pixels' response, by products of photographs of different skies, over the pixels that a star lies on",
+            "the pixels' response, by products of photographs of different skies, over the pixels"
+            " that a star lies on",
         ),
         Part(
             "flat field",
@@ -210,12 +213,16 @@ def _scintillation(
         return Part(
             LAW,
             math.nan,
-            "not known: no star is in two photographs, and no air mass, as refraction was not fitted",
+            "not known: no star is in two photographs, and no air mass, as refraction was not"
+            " fitted",
         )
     mass, site = float(np.mean(masses)), session.file.config.site
     height_m = 0.0 if site is None else site.height_m
     sigma = float(young(tracker.aperture_mm, np.array([mass]), height_m, tracker.exposure_s)[0])
-    how = f"Young's law at {height_m:g} m: air mass {mass:.2f}, {tracker.aperture_mm:g} mm and {tracker.exposure_s:g} s"
+    how = (
+        f"Young's law at {height_m:g} m: air mass {mass:.2f}, {tracker.aperture_mm:g} mm and"
+        f" {tracker.exposure_s:g} s"
+    )
     return Part(
         LAW,
         MAG * sigma,

@@ -34,7 +34,10 @@ PER_PX, HALF_PX = 4, 6  # samples a pixel, and half of a PSF image's side
 MODEL = "confront: "  # before the PSF's own numbers in the file's history
 # a 24 inch screen, for a bench whose file has no monitor
 SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95
-PLACEHOLDER = "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm = 1000.0\n"
+PLACEHOLDER = (
+    "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm"
+    " = 1000.0\n"
+)
 UNDATED = '[sky]\nepoch_utc = "2000-01-01T00:00:00Z"\n'
 NAMES = ("tracker.toml", "tracker_distortion.toml", "tracker_qe.csv", "tracker_psf.fits")
 PATH_KEYS = {
@@ -63,9 +66,10 @@ def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
     has_screen = "monitor" in tables or "collimator" in tables
     if "site" in tables and "sky" not in tables:
         text = f"{text.rstrip()}\n{UNDATED}"  # photographs have dates of their own
-    return bench_file_of(
-        path, text if has_screen else f"{text.rstrip()}\n{PLACEHOLDER}"
-    ), has_screen
+    return (
+        bench_file_of(path, text if has_screen else f"{text.rstrip()}\n{PLACEHOLDER}"),
+        has_screen,
+    )
 
 
 def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:

@@ -81,12 +81,14 @@ def read_photographs(
     size = dn.shape[1], dn.shape[0]
     if min(size) < MIN_SIDE_PX:
         raise InputError(
-            f"{path}: {size[0]} x {size[1]} px is too small to hold a field of stars; give a whole frame"
+            f"{path}: {size[0]} x {size[1]} px is too small to hold a field of stars; give a whole"
+            " frame"
         )
     if resolution_px is not None and size != resolution_px:
         raise InputError(
-            f"{path}: is {size[0]} x {size[1]} px, and [tracker] resolution_px is {list(resolution_px)}; give whole frames as"
-            f" they were taken, or write resolution_px = [{size[0]}, {size[1]}]"
+            f"{path}: is {size[0]} x {size[1]} px, and [tracker] resolution_px is"
+            f" {list(resolution_px)}; give whole frames as they were taken, or write resolution_px"
+            f" = [{size[0]}, {size[1]}]"
         )
     step, full = _levels(path, dn)
     t_ns, notes = at_ns if at_ns is not None else facts.t_ns, facts.notes
@@ -115,15 +117,16 @@ def _grey(path: Path, pixels: npt.NDArray[Any], facts: _Facts) -> FloatArray:
         spread = np.ptp(pixels.astype(np.float64), axis=2)[bright]
         if np.median(spread) > GREY_SPREAD * np.median(mean[bright]):
             raise InputError(
-                f"{path}: has three colours for each pixel, which a camera interpolated; give the raw frame, or one channel"
-                " of it as a grey image"
+                f"{path}: has three colours for each pixel, which a camera interpolated; give the"
+                " raw frame, or one channel of it as a grey image"
             )
         pixels = mean
     if pixels.ndim == 3 and 1 in {pixels.shape[0], pixels.shape[2]}:
         pixels = pixels.squeeze()
     if pixels.ndim != 2 or pixels.dtype.kind not in "uif":
         raise InputError(
-            f"{path}: is no grey image of one plane ({' x '.join(map(str, pixels.shape))}); {ADVICE}"
+            f"{path}: is no grey image of one plane ({' x '.join(map(str, pixels.shape))});"
+            f" {ADVICE}"
         )
     dn = pixels.astype(np.float64)
     if not np.isfinite(dn).all():
@@ -143,11 +146,13 @@ def _levels(path: Path, dn: FloatArray) -> tuple[float, float]:
     share = float(at_top.mean())
     if share > MAX_SATURATED_SHARE and top > 0:
         raise InputError(
-            f"{path}: {share:.0%} of its pixels are saturated at {top:g}; expose shorter, or at a darker sky"
+            f"{path}: {share:.0%} of its pixels are saturated at {top:g}; expose shorter, or at a"
+            " darker sky"
         )
     if len(values) < 3:
         raise InputError(
-            f"{path}: every pixel is {' or '.join(f'{v:g}' for v in values)}; give a frame with stars"
+            f"{path}: every pixel is {' or '.join(f'{v:g}' for v in values)}; give a frame with"
+            " stars"
         )
     # a saturated level may be one less than a multiple of the step, as 65535 is
     inner = values[:-1]
@@ -179,8 +184,8 @@ def _fits(
         ) from error
     if set(fits_image.header) >= MAP_KEYS:
         raise InputError(
-            f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
-            " is no photograph; leave it out"
+            f"{path}: has the direction of each pixel of an all-sky camera"
+            f" ({', '.join(sorted(MAP_KEYS))}), and is no photograph; leave it out"
         )
     # An exposure of 0 s is that of a bias, or was never filled in.
     exposure_s = fits_image.exposure_s or None
@@ -198,7 +203,10 @@ def _picture(
             notes: tuple[str, ...] = ()
             if picture.format in {"JPEG", "MPO", "WEBP"}:
                 notes = (
-                    "a JPEG: its tone curve is not known, and compression moves faint stars; a raw frame is better",
+                    (
+                        "a JPEG: its tone curve is not known, and compression moves faint stars; a"
+                        " raw frame is better"
+                    ),
                 )
             if picture.mode in {"P", "1", "CMYK"}:
                 raise InputError(

@@ -233,9 +233,11 @@ class Judge:
         rows = self._rows(number, expected)
         dim, cells = _dim_regions(rows, shot.photo.size_px)
         rows = [
-            replace(row, flags=(*row.flags, "dim region"))
-            if cells(row) and "missing" not in row.flags
-            else row
+            (
+                replace(row, flags=(*row.flags, "dim region"))
+                if cells(row) and "missing" not in row.flags
+                else row
+            )
             for row in rows
         ]
         light_sigma = light_dn / np.sqrt(variance)
@@ -255,9 +257,9 @@ class Judge:
             rms_mag=_rms(mag[np.isfinite(mag)]),
             counted=len(counted),
             background_chi2=float((chi**2).mean()) if len(chi) else math.nan,
-            star_chi2=float(np.median(shot.found.chi2[shot.clean]))
-            if shot.clean.any()
-            else math.nan,
+            star_chi2=(
+                float(np.median(shot.found.chi2[shot.clean])) if shot.clean.any() else math.nan
+            ),
             dim=dim,
             dated=self._dated(number),
             fainter=self._fainter(number, expected),

@@ -77,7 +77,10 @@ def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> N
     )
     body = [
         f"<style>{STYLE.read_text()}</style>",
-        f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b> {escaped(verdict)}.</p>',
+        (
+            f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b>'
+            f" {escaped(verdict)}.</p>"
+        ),
         *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
         "<h2>Verdicts</h2><ul>"
         + "".join(f"<li>{escaped(line)}</li>" for line in found.lines)
@@ -142,17 +145,20 @@ def _frame(verdict: Verdict, pictures: Pictures) -> str:
         f'<circle cx="{r.x_predicted_px:.0f}" cy="{r.y_predicted_px:.0f}" r="10" stroke="#6cb6ff"/>'
         for r in verdict.missing
     ]
-    over = f'<svg viewBox="-0.5 -0.5 {width} {height}" fill="none" stroke-width="1.5">{"".join(marks)}</svg>'
+    over = (
+        f'<svg viewBox="-0.5 -0.5 {width} {height}" fill="none"'
+        f' stroke-width="1.5">{"".join(marks)}</svg>'
+    )
     images = "".join(
         f'<img alt="{name}" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
         for name, data in zip(VIEWS, pictures.views, strict=True)
     )
     buttons = "".join(f"<button>{name}</button> " for name in (*VIEWS, "blink", "side by side"))
     return (
-        f'<h2>{escaped(verdict.shot.photo.name)}</h2><div class="frame"><p>{buttons}</p>'
-        f'<div class="views">{images}{over}</div></div>'
-        f'<p class="small">Squares: sources over {LISTED_SNR:g} sigmas that nothing explains. Circles: stars that are missing.'
-        f" Residual: black is -{RESIDUAL:g}, white +{RESIDUAL:g} sigmas.</p>"
+        f'<h2>{escaped(verdict.shot.photo.name)}</h2><div class="frame"><p>{buttons}</p><div'
+        f' class="views">{images}{over}</div></div><p class="small">Squares: sources over'
+        f" {LISTED_SNR:g} sigmas that nothing explains. Circles: stars that are missing. Residual:"
+        f" black is -{RESIDUAL:g}, white +{RESIDUAL:g} sigmas.</p>"
     )
 
 
@@ -183,7 +189,10 @@ def _flux(found: Confronted, rows: Sequence[Any]) -> str:
     counted = np.array([row.counted for row in rows])
     rms = math.sqrt(float((off[counted] ** 2).mean())) if counted.any() else math.nan
     finding = f"Stars to V = 6.5 are {rms:.3f} mag rms off their prediction"
-    note = "Stars that stand alone and are not saturated. Filled: to V = 6.5. Off: seen less predicted, up where too faint."
+    note = (
+        "Stars that stand alone and are not saturated. Filled: to V = 6.5. Off: seen less"
+        " predicted, up where too faint."
+    )
     with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.9) as panels:
         for axes, x, y, names in (
             (panels[0], v, -2.5 * np.log10(dn), ("V [mag]", "-2.5 log10 DN")),
@@ -268,7 +277,10 @@ def _psf_grid(session: Session) -> str:
 def _transfer(session: Session) -> str:
     pixels = session.pixels
     level, variance = pixels.points.T
-    finding = f"{pixels.gain_words}, {pixels.read_noise_e:.2f} e- of read noise at {pixels.pedestal_dn:.0f} DN"
+    finding = (
+        f"{pixels.gain_words}, {pixels.read_noise_e:.2f} e- of read noise at"
+        f" {pixels.pedestal_dn:.0f} DN"
+    )
     with panels_of(finding, height_inch=3.8) as panels:
         axes = panels[0]
         axes.plot(level, variance, ".", ms=2.5, color=MUTED, rasterized=True)
@@ -284,7 +296,10 @@ def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str
     columns = min(len(verdicts), 4)
     rows = math.ceil(len(verdicts) / columns)
     finding = f"The background's chi² is {min(chi2):.3f} to {max(chi2):.3f}"
-    note = "Mean square of all residuals in a part of the image, stars among them, each up to 5 sigmas."
+    note = (
+        "Mean square of all residuals in a part of the image, stars among them, each up to 5"
+        " sigmas."
+    )
     with panels_of(
         finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows
     ) as panels:

@@ -257,7 +257,7 @@ def _by_response(
         note += (
             f"; but the noise, {math.sqrt(max(noise2, 0.0)):.3g} DN, is less than its shot noise,"
             f" {math.sqrt(shot2):.3g} DN: write [tracker.detector] gain_e_per_dn = {least:.3g} or"
-            f" more"
+            " more"
         )
         return replace(bench, notes=(*bench.notes, note))
     if math.isfinite(bench.pattern.errors[0]):

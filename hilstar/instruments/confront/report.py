@@ -65,31 +65,39 @@ class Confronted:
                 "colour_terms": light.colour_terms,
                 "vignetting_mag": list(light.vignetting_mag),
                 "extinction_mag_per_air_mass": extinction_of(session),
-                "linearity_power": session.power * light.linearity
-                if session.power != 1.0
-                else light.linearity,
+                "linearity_power": (
+                    session.power * light.linearity if session.power != 1.0 else light.linearity
+                ),
                 "tone_curve": session.power != 1.0,
-                "fixed_pattern": None
-                if not math.isfinite(pixels.pattern.errors[0])
-                else dict(zip(KINDS, pixels.pattern.rms, strict=True)),
+                "fixed_pattern": (
+                    None
+                    if not math.isfinite(pixels.pattern.errors[0])
+                    else dict(zip(KINDS, pixels.pattern.rms, strict=True))
+                ),
                 "hot_pixels": self.defects[0],
                 "dead_pixels": self.defects[1],
-                "sigma": {
-                    "focal_length_px": focal * sigma["log_focal"] if "log_focal" in sigma else None
+                "sigma": (
+                    {
+                        "focal_length_px": (
+                            focal * sigma["log_focal"] if "log_focal" in sigma else None
+                        )
+                    }
+                    | {"principal_point_px": [sigma.get("centre_x"), sigma.get("centre_y")]}
+                    | {name: sigma[name] for name in ("k1", "k2", "p1", "p2") if name in sigma}
+                    | {name: _number(value) for name, value in (light.sigma | pixels.sigma).items()}
+                ),
+            },
+            "excess": (
+                None
+                if self.excess is None
+                else {
+                    "stars": self.excess.stars,
+                    "rms_px": self.excess.rms_px,
+                    "rms_mag": self.excess.rms_mag,
+                    "light_mag": {one.name: _number(one.rms) for one in self.excess.light},
+                    "places_px": {one.name: _number(one.rms) for one in self.excess.places},
                 }
-                | {"principal_point_px": [sigma.get("centre_x"), sigma.get("centre_y")]}
-                | {name: sigma[name] for name in ("k1", "k2", "p1", "p2") if name in sigma}
-                | {name: _number(value) for name, value in (light.sigma | pixels.sigma).items()},
-            },
-            "excess": None
-            if self.excess is None
-            else {
-                "stars": self.excess.stars,
-                "rms_px": self.excess.rms_px,
-                "rms_mag": self.excess.rms_mag,
-                "light_mag": {one.name: _number(one.rms) for one in self.excess.light},
-                "places_px": {one.name: _number(one.rms) for one in self.excess.places},
-            },
+            ),
             "fixed": session.fixed,
             "passed": not self.failures,
             "failures": list(self.failures),
@@ -164,8 +172,9 @@ def _fwhms(session: Session) -> FloatArray:
 def words_of(verdict: Verdict) -> str:
     """One photograph in a line."""
     return (
-        f"{verdict.counted} stars to V = 6.5 within {verdict.rms_px:.3f} px and {verdict.rms_mag:.3f} mag, background chi2"
-        f" {verdict.background_chi2:.3f}, {len(verdict.unexplained)} sources unexplained, {len(verdict.missing)} stars missing"
+        f"{verdict.counted} stars to V = 6.5 within {verdict.rms_px:.3f} px and"
+        f" {verdict.rms_mag:.3f} mag, background chi2 {verdict.background_chi2:.3f},"
+        f" {len(verdict.unexplained)} sources unexplained, {len(verdict.missing)} stars missing"
     )
 
 
@@ -176,12 +185,19 @@ def lines_of(
     camera, light, pixels = session.camera, session.light, session.pixels
     lens = camera.camera.lens
     found = [
-        f"lens: {camera.camera.focal_length_px:.2f} px of focal length, k1 = {lens.radial[0] if lens else 0:.4f}"
-        f" ({camera.model})",
-        f"PSF: {np.median(_fwhms(session)):.2f} px full width at half maximum, pixel included,"
-        f" {np.min(_fwhms(session)):.2f} to {np.max(_fwhms(session)):.2f} px over the field",
-        f"detector: {pixels.gain_words}, {pixels.gain_e_per_dn * pixels.step_dn:.3g} a step of"
-        f" {pixels.step_dn:.3g} DN, read noise {pixels.read_noise_e:.2f} e-, pedestal {pixels.pedestal_dn:.0f} DN",
+        (
+            f"lens: {camera.camera.focal_length_px:.2f} px of focal length, k1 ="
+            f" {lens.radial[0] if lens else 0:.4f} ({camera.model})"
+        ),
+        (
+            f"PSF: {np.median(_fwhms(session)):.2f} px full width at half maximum, pixel included,"
+            f" {np.min(_fwhms(session)):.2f} to {np.max(_fwhms(session)):.2f} px over the field"
+        ),
+        (
+            f"detector: {pixels.gain_words}, {pixels.gain_e_per_dn * pixels.step_dn:.3g} a step of"
+            f" {pixels.step_dn:.3g} DN, read noise {pixels.read_noise_e:.2f} e-, pedestal"
+            f" {pixels.pedestal_dn:.0f} DN"
+        ),
     ]
     if math.isfinite(pixels.pattern.errors[0]) and not session.fixed:
         found.append(f"fixed pattern: {pixels.pattern.words()}")
@@ -202,12 +218,14 @@ def lines_of(
         sigma = next(value for name, value in light.sigma.items() if name.startswith("extinction"))
         masses = [one for one in light.masses if one is not None]
         found.append(
-            f"extinction: {extinction:.3f} +- {sigma:.3f} mag an air mass, over {min(masses):.2f} to {max(masses):.2f} of them"
+            f"extinction: {extinction:.3f} +- {sigma:.3f} mag an air mass, over {min(masses):.2f}"
+            f" to {max(masses):.2f} of them"
         )
     skies = [v for k in range(len(session.shots)) if (v := sky_v_mag(session, k)) is not None]
     if skies:
         found.append(
-            f"sky: V {min(skies):.2f} to {max(skies):.2f} mag/arcsec2, if its spectrum is that of [site] sky_spectrum"
+            f"sky: V {min(skies):.2f} to {max(skies):.2f} mag/arcsec2, if its spectrum is that of"
+            " [site] sky_spectrum"
         )
     if defects[0] or defects[1]:
         found.append(f"pixels: {defects[0]} hot and {defects[1]} dead, in most of the photographs")
@@ -218,7 +236,8 @@ def lines_of(
         ]
     if excess is not None:
         found.append(
-            f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis, {excess.rms_mag:.3f} mag"
+            f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis,"
+            f" {excess.rms_mag:.3f} mag"
         )
     return found
 
@@ -227,7 +246,10 @@ def _tone(session: Session) -> str:
     """Whether DN go as light, in words."""
     power, light = session.power, session.light
     if power != 1.0:
-        return f"a tone curve: DN go as light to the power {power:.3f} (gamma {1 / power:.2f}); other figures are without it"
+        return (
+            f"a tone curve: DN go as light to the power {power:.3f} (gamma {1 / power:.2f}); other"
+            " figures are without it"
+        )
     sigma = light.sigma["linearity"]
     said = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
     bent = abs(light.linearity - 1) > max(LINEAR_OFF, LINEAR_SIGMAS * sigma)
@@ -243,9 +265,9 @@ def _beyond(verdict: Verdict) -> Iterator[str]:
     fainter = verdict.fainter
     if verdict.unexplained and fainter.expected >= 1:
         yield (
-            f"{len(verdict.unexplained)} sources unexplained; about {fainter.expected:.0f} stars fainter than the catalogue's"
-            f" limit are to be expected: it is complete to V = {fainter.complete_v_mag:.1f}, the image reaches"
-            f" {fainter.reached_v_mag:.1f}"
+            f"{len(verdict.unexplained)} sources unexplained; about {fainter.expected:.0f} stars"
+            " fainter than the catalogue's limit are to be expected: it is complete to V ="
+            f" {fainter.complete_v_mag:.1f}, the image reaches {fainter.reached_v_mag:.1f}"
         )
 
 
@@ -255,7 +277,10 @@ def _dated(verdict: Verdict) -> Iterator[str]:
     if dated is None or verdict.shot.photo.t_ns is None:
         return
     if abs(dated.years) > max(5 * dated.sigma, 1.0):
-        yield f"its date is off: its stars stand {dated.years:+.1f} +- {dated.sigma:.1f} years from it"
+        yield (
+            f"its date is off: its stars stand {dated.years:+.1f} +- {dated.sigma:.1f} years"
+            " from it"
+        )
     elif dated.sigma > UNSURE_YEARS:
         yield f"no star in it is fast enough to check its year (+- {dated.sigma:.0f} years)"
 
@@ -277,7 +302,8 @@ def failures_of(verdicts: Sequence[Verdict]) -> list[str]:
                 found.append(f"{name}: {what} are {value:.3f} {unit} rms off, over {limit:g}")
         if not CHI2[0] <= verdict.background_chi2 <= CHI2[1]:
             found.append(
-                f"{name}: background chi2 {verdict.background_chi2:.2f} is outside {CHI2[0]:g} to {CHI2[1]:g}"
+                f"{name}: background chi2 {verdict.background_chi2:.2f} is outside {CHI2[0]:g} to"
+                f" {CHI2[1]:g}"
             )
         found += [f"{name}: {line}" for line in verdict.dim]
     return found

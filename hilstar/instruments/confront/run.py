@@ -72,7 +72,8 @@ def confront(
         session = run_session(file, photos, _base(file, photos), start, fixed=held)
     except np.linalg.LinAlgError as error:
         raise InputError(
-            f"{photos[0].path}: its levels allow no fit ({error}); give raw frames, 8 to 16 bits of grey"
+            f"{photos[0].path}: its levels allow no fit ({error}); give raw frames, 8 to 16 bits of"
+            " grey"
         ) from error
     make_directory(output)
     tracker = bench if fixed and has_screen else write_tracker(output, session, has_screen)

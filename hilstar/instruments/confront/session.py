@@ -198,13 +198,14 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     found = _solve(field, base, sky, start) if len(field.places_px) >= MIN_MATCHED else None
     if found is None and is_round(photo.dn):
         raise InputError(
-            f"{photo.path}: its light fills a circle between dark corners: an all-sky lens, of which hilstar has no model; give"
-            " frames of a lens under 120 degrees, whose sky fills the image"
+            f"{photo.path}: its light fills a circle between dark corners: an all-sky lens, of"
+            " which hilstar has no model; give frames of a lens under 120 degrees, whose sky fills"
+            " the image"
         )
     if len(field.places_px) < MIN_MATCHED:
         raise InputError(
-            f"{photo.path}: {len(field.places_px)} sources stand out of its noise, and an attitude takes {MIN_MATCHED}; expose"
-            " longer, open the cap, or look at a sky without cloud"
+            f"{photo.path}: {len(field.places_px)} sources stand out of its noise, and an attitude"
+            f" takes {MIN_MATCHED}; expose longer, open the cap, or look at a sky without cloud"
         )
     if found is None:
         raise InputError(f"{photo.path}: {_why_not(field, base, sky, sources, points, start)}")
@@ -213,7 +214,8 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     wide_px = float(np.median(sources.fwhm_px[np.sort(matched.source)[:BRIGHTEST]]))
     if wide_px > WIDE_PX:
         raise InputError(
-            f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus"
+            f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in"
+            " focus"
         )
     return Shot(
         photo,
@@ -265,7 +267,10 @@ def _why_not(
             if sources.trail.sum() >= MIN_MATCHED
             else np.array([length])
         )
-        return f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at rest, or a shorter exposure"
+        return (
+            f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at"
+            " rest, or a shorter exposure"
+        )
     if (wide := np.median(sources.fwhm_px[bright])) > WIDE_PX:
         return f"its sources are {wide:.0f} px wide; focus the lens, or give a frame in focus"
     mirrored = replace(field, places_px=field.places_px * [-1, 1])
@@ -277,8 +282,8 @@ def _why_not(
     degrees = math.degrees(2 * math.atan(field.width_px / 2 / base.focal_length_px))
     asked = " near --radec" if start is not None else ""
     return (
-        f"{seen}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and pixel_pitch_um"
-        + ("" if start is not None else ", or give --radec RA,DEC,ROLL")
+        f"{seen}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and"
+        " pixel_pitch_um" + ("" if start is not None else ", or give --radec RA,DEC,ROLL")
     )
 
 
@@ -613,9 +618,10 @@ def _middles(stamps: Stamps) -> tuple[FloatArray, FloatArray]:
     part = np.maximum(stamps.values[:, HALF - 2 : HALF + 3, HALF - 2 : HALF + 3], 0)
     total = np.maximum(part.sum(axis=(1, 2)), 1e-9)
     reach = np.arange(-2, 3)
-    return stamps.column + part.sum(axis=1) @ reach / total, stamps.row + part.sum(
-        axis=2
-    ) @ reach / total
+    return (
+        stamps.column + part.sum(axis=1) @ reach / total,
+        stamps.row + part.sum(axis=2) @ reach / total,
+    )
 
 
 def _measure(shot: Shot, psf: StarPsf, gain: float) -> None:

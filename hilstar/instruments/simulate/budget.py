@@ -290,14 +290,23 @@ def write_report(directory: Path, found: LightBudget) -> None:
         [["" if v is None else v for v in row.values()] for row in rows],
     )
     reach = found.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
-    finding = f"{found.bits} bits, {found.method}: from V = {found.clips_v_mag:.1f}, where stars clip, within "
+    finding = (
+        f"{found.bits} bits, {found.method}: from V = {found.clips_v_mag:.1f}, where stars clip,"
+        " within "
+    )
     finding += (
         f"{FLUX_LIMITS_MAG[1]:g} mag over {'no' if reach is None else f'{reach:g}'} magnitudes"
     )
     shown = [row for row in found.rows if row.flux_max_mag is not None]
     v_mag = np.array([row.v_mag for row in shown])
-    note = f"Left of the first grey line stars clip (V = {found.clips_v_mag:.2f}), right of the second they show nothing (V ="
-    note += f" {found.nothing_v_mag:.2f}). Over sub-pixel phases; places by {found.centroider} but in the last panel."
+    note = (
+        f"Left of the first grey line stars clip (V = {found.clips_v_mag:.2f}), right of the second"
+        " they show nothing (V ="
+    )
+    note += (
+        f" {found.nothing_v_mag:.2f}). Over sub-pixel phases; places by {found.centroider} but in"
+        " the last panel."
+    )
     with chart(directory / "budget", finding, 3, note=note) as axes:
         for axis, kind, limits, label in (
             (axes[0], "flux", FLUX_LIMITS_MAG, "flux error [mag]"),
@@ -341,13 +350,22 @@ def budget_lines(found: LightBudget) -> list[str]:
     )
     lines = [
         f"{'method':22}{found.method}, {found.bits} bits",
-        f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel, {found.clips_v_mag_at_best:.2f} on a corner",
-        f"{'shows nothing':22}from V = {found.nothing_v_mag:.2f}, a range of {found.range_mag:.1f} mag",
+        (
+            f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel,"
+            f" {found.clips_v_mag_at_best:.2f} on a corner"
+        ),
+        (
+            f"{'shows nothing':22}from V = {found.nothing_v_mag:.2f}, a range of"
+            f" {found.range_mag:.1f} mag"
+        ),
         f"{'below full scale':22}{within}",
         f"{'centroider':22}{found.centroider}, in the tracker's pixels after its blur",
         f"{f'{COMPARED_MAG:g} mag below it':22}{each} px rms along an axis",
         f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
-        f"{'not drawn':22}{found.left_out.stars} stars, too faint: {found.left_out.flux_share:.2e} of all light",
+        (
+            f"{'not drawn':22}{found.left_out.stars} stars, too faint:"
+            f" {found.left_out.flux_share:.2e} of all light"
+        ),
         f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",
         f"{'in the tracker':22}{found.star.line()}",
     ]
@@ -355,13 +373,15 @@ def budget_lines(found: LightBudget) -> list[str]:
         one = found.primaries
         figure = _number(one.condition, ".2f")
         lines.append(
-            f"{'condition number':22}{figure}, electrons of each channel by each primary at full light:"
+            f"{'condition number':22}{figure}, electrons of each channel by each primary at full"
+            " light:"
         )
         if found.out_of_gamut is not None:
             what = "electrons by channel" if len(one.channels) > 1 else "mean wavelength"
             lines.insert(
                 -1,
-                f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries cannot show",
+                f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries"
+                " cannot show",
             )
         for channel, rates in zip(one.channels, one.e_per_s.tolist(), strict=True):
             shares = (
@@ -384,7 +404,8 @@ def budget_lines(found: LightBudget) -> list[str]:
         + ("" if every else f"{'max arcsec':>12}"),
     ]
     for row in found.rows:
-        line = f"{row.v_mag:6.2f}{_number(row.flux_rms_mag, '.4f'):>12}{_number(row.flux_max_mag, '.4f'):>10}"
+        rms_mag, max_mag = (_number(mag, ".4f") for mag in (row.flux_rms_mag, row.flux_max_mag))
+        line = f"{row.v_mag:6.2f}{rms_mag:>12}{max_mag:>10}"
         if every:
             line += " " * 4 + "".join(
                 f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY

@@ -457,7 +457,8 @@ def noise_budget(
         raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
     if not len(stars):
         raise InputError(
-            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude"
+            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger"
+            " magnitude"
         )
     background = TrackerBackground(config, file.folder, camera)
     sights, levels_e = [], []
@@ -627,10 +628,16 @@ def write_noise(directory: Path, found: NoiseBudget) -> None:
 def _draw(path: Path, found: NoiseBudget) -> None:
     last, own = found.nea_arcsec, found.centroider
     limit, reached = (" and ".join(map(two_digits, last[kind].values())) for kind in ("limit", own))
-    finding = f"Stars to V = {found.nea[-1]['v_mag']:g} allow {limit} arcsec across and about the boresight;"
+    finding = (
+        f"Stars to V = {found.nea[-1]['v_mag']:g} allow {limit} arcsec across and about the"
+        " boresight;"
+    )
     finding += f" {own} reaches {reached}"
     where = "the field" if found.fields == 1 else f"{found.fields} fields all over the sky, median"
-    note = f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated {own}."
+    note = (
+        f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated"
+        f" {own}."
+    )
     with chart(path, finding, 1, 2, note=note, share_x=False, share_y=True) as panels:
         for axes, key, label in zip(
             panels, ("v_mag", "stars"), ("faintest V [mag]", "stars"), strict=True
@@ -654,9 +661,14 @@ def noise_lines(found: NoiseBudget) -> Iterator[str]:
     """The budget for a person."""
     own = found.centroider
     threshold = f"{found.minimum_pixels} px above {found.threshold_sigma:g} sigma"
-    yield f"{'found':22}{threshold} of a background of {found.background_e_per_px:.4g} e- in a pixel"
+    yield (
+        f"{'found':22}{threshold} of a background of {found.background_e_per_px:.4g} e- in a pixel"
+    )
     for name, one in found.channels.items():
-        figures = f"{one['star_share']:.1%} of a star of the Sun's colour, background {one['background_e_per_px']:.4g} e-"
+        figures = (
+            f"{one['star_share']:.1%} of a star of the Sun's colour, background"
+            f" {one['background_e_per_px']:.4g} e-"
+        )
         yield f"{'pixels of ' + name:22}{figures}"
     for kind, nea in found.nea_arcsec.items():
         told = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
@@ -669,7 +681,8 @@ def noise_lines(found: NoiseBudget) -> Iterator[str]:
     yield ""
     snr = [f"snr_{name}" for name in found.channels]
     titles = "".join(f"{'SNR ' + name:>8}" for name in found.channels)
-    yield f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}{titles}{'detection':>11}{'bound px':>10}{own + ' px':>12}"
+    sums = f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}"
+    yield f"{sums}{titles}{'detection':>11}{'bound px':>10}{own + ' px':>12}"
     for row in found.rows:
         reached = row[f"{own}_px"]
         yield (

@@ -86,7 +86,10 @@ EXPOSURE_DTYPE = np.dtype(
     ]
 )
 CLIPPED_PX = 3  # a side of the square about a star with pixels of every colour beside its own
-NO_MOSAIC = 'quantum_efficiency_r, _g and _b without a mosaic: each pixel adds them up; write [tracker.detector] bayer = "rggb"'
+NO_MOSAIC = (
+    "quantum_efficiency_r, _g and _b without a mosaic: each pixel adds them up; write"
+    ' [tracker.detector] bayer = "rggb"'
+)
 BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
 
@@ -624,7 +627,10 @@ class TrackerBackground:
 
     def _say(self, nearest_deg: float, *, beyond: bool) -> None:
         """Refuse a field beyond the table, or warn of it where it follows one that was not."""
-        what = f"[background] zodiacal: the field comes within {nearest_deg:.1f} deg of the Sun, where Leinert's table is blank"
+        what = (
+            f"[background] zodiacal: the field comes within {nearest_deg:.1f} deg of the Sun, where"
+            " Leinert's table is blank"
+        )
         if beyond and self._refuse:
             raise InputError(f"{what}; look farther from it, or write zodiacal_v_mag_arcsec2")
         if beyond and not self._beyond:
@@ -656,7 +662,8 @@ def background_e(config: BenchConfig, optics: Optics, pixel_sr: FloatArray) -> F
     total_e: FloatArray = level_e + ramp_e
     if total_e.min() < 0:
         raise InputError(
-            f"[background] gradient_electrons_across = {[across_e, down_e]}: takes the darkest corner to"
-            f" {total_e.min():.4g} electrons; write a larger background or a smaller gradient"
+            f"[background] gradient_electrons_across = {[across_e, down_e]}: takes the darkest"
+            f" corner to {total_e.min():.4g} electrons; write a larger background or a smaller"
+            " gradient"
         )
     return total_e

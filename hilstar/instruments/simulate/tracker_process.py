@@ -245,15 +245,17 @@ class TrackerProcess:
             raw=b"",
             t_ns=clock.of_host(middle_ns),
             q_icrs_to_cam=q,
-            rate_cam_rad_s=self._tracker.rate_cam_rad_s()
-            if q is not None and solved.mode == TRACKING
-            else None,
+            rate_cam_rad_s=(
+                self._tracker.rate_cam_rad_s()
+                if q is not None and solved.mode == TRACKING
+                else None
+            ),
             valid=q is not None,
             mode=solved.mode,
             star_count=stars,
-            rms_arcsec=None
-            if solved.identified is None
-            else solved.identified.rms_rad * ARCSEC_PER_RAD,
+            rms_arcsec=(
+                None if solved.identified is None else solved.identified.rms_rad * ARCSEC_PER_RAD
+            ),
             centroids=self._tracker.reported_stars(solved),
         )
         heapq.heappush(

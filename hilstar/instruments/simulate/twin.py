@@ -328,7 +328,8 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
     norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
     if abs(norm - 1) > NORM_TOLERANCE:
         raise InputError(
-            f"{bench.file.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
+            f"{bench.file.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit"
+            " quaternion w, x, y, z"
         )
     camera = monitor_camera(
         monitor.resolution_px,

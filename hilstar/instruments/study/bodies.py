@@ -432,16 +432,18 @@ def _size_line(sizes: Sequence[Exactness]) -> str:
     limb_px = float(np.nanmax([size.limb_off_px for size in sizes]))
     worst = max(sizes, key=lambda size: abs(size.flux_off))
     return (
-        f"discs of {sizes[0].radius_px:g} to {max(s.radius_px for s in sizes):g} px in radius have their light within"
-        f" {100 * abs(worst.flux_off):.2g} % and their limb within {limb_px:.3f} px of rays in float64"
+        f"discs of {sizes[0].radius_px:g} to {max(s.radius_px for s in sizes):g} px in radius have"
+        f" their light within {100 * abs(worst.flux_off):.2g} % and their limb within {limb_px:.3f}"
+        " px of rays in float64"
     )
 
 
 def _limits_line(nears: Sequence[Near]) -> str:
     slowest = max(nears, key=lambda near: near.cpu_ms)
     return (
-        f"a body in view takes at most {slowest.cpu_ms:.0f} ms of processor time a frame ({slowest.body} at {slowest.off_deg:g}"
-        f" degrees); every pixel's light is {light_words(nears)}"
+        f"a body in view takes at most {slowest.cpu_ms:.0f} ms of processor time a frame"
+        f" ({slowest.body} at {slowest.off_deg:g} degrees); every pixel's light is"
+        f" {light_words(nears)}"
     )
 
 
@@ -457,10 +459,13 @@ def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
     dearest = max(costs, key=lambda cost: cost.cpu_ms)
     unseen = [cost.cpu_ms for cost in costs if not cost.discs and not at_a_step(cost.scene)]
     unseen_ms = max(0.0, *unseen)
-    note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."
+    note = (
+        "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x"
+        " 1080, drawn in software."
+    )
     finding = (
-        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms:.1f} ms; the dearest body,"
-        f" {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms:.1f} ms; the"
+        f" dearest body, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
     title = load.title(finding, "Bodies of each kind on top of a frame")
     with chart(path, title, note=load.note(note), height_inch=4.4) as (axes,):
@@ -472,14 +477,18 @@ def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
         )
         axes.set_xlabel("processor time on top [ms]")
     return (
-        f"bodies that are not in view, or points, take at most {unseen_ms:.1f} ms of processor time a frame, and all of them"
-        f" {max(costs[-1].cpu_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+        f"bodies that are not in view, or points, take at most {unseen_ms:.1f} ms of processor time"
+        f" a frame, and all of them {max(costs[-1].cpu_ms, 0.0):.1f} ms once in 2 s; the dearest:"
+        f" {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
 
 
 def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
     """The errors of discs against their radius."""
-    note = f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it is drawn as a point."
+    note = (
+        f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it"
+        " is drawn as a point."
+    )
     with chart(path, _size_line(sizes), panels=3, note=note, height_inch=8.4) as panels:
         light, place, pixel = panels
         for phase_deg, colour in zip(PHASES_DEG, SERIES, strict=False):
@@ -513,7 +522,10 @@ def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
 
 def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
     """Processor time and light as bodies come near."""
-    note = "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080, drawn in software."
+    note = (
+        "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080,"
+        " drawn in software."
+    )
     title = load.title(_limits_line(nears), f"Every pixel's light is {light_words(nears)}")
     with chart(path, title, panels=2, note=load.note(note)) as (times, light):
         for body, colour in zip(dict.fromkeys(near.body for near in nears), SERIES, strict=False):

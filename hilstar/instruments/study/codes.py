@@ -240,10 +240,13 @@ def draw(path: Path, left: list[OverFrames]) -> None:
         if row.frames == AIM_FRAMES and row.method == "temporal"
     }
     finding = (
-        f"Over any {AIM_FRAMES} frames temporal places stars within {at[names[0]]:.2g} px rms on {names[0]},"
-        f" and within {at[names[-1]]:.2g} px on {names[-1]}"
+        f"Over any {AIM_FRAMES} frames temporal places stars within {at[names[0]]:.2g} px rms on"
+        f" {names[0]}, and within {at[names[-1]]:.2g} px on {names[-1]}"
     )
-    note = "Solid: temporal. Dotted: dither with a mask that turns. Steps: a star's light in steps of the panel from black."
+    note = (
+        "Solid: temporal. Dotted: dither with a mask that turns. Steps: a star's light in steps of"
+        " the panel from black."
+    )
     with chart(path, finding, panels=2, note=note) as (flux, place):
         for name, colour in zip(names, (BLUE, ORANGE, GREEN, PURPLE, TEAL), strict=True):
             for method, style in (("temporal", "-o"), ("dither", ":")):

@@ -440,8 +440,14 @@ def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
         if (one["tracker"], one["method"]) == ("Bayer", "exact")
     }
     star, white = exact["star"], exact["white"]
-    finding = f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker, white {white['subtypes']:.0f}"
-    note = "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone stars of"
+    finding = (
+        f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker,"
+        f" white {white['subtypes']:.0f}"
+    )
+    note = (
+        "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone"
+        " stars of"
+    )
     note += " V = 1 to 5.5 on an sRGB LCD of 8 bits."
     labels = {
         "subtypes": "colour, mean\n[subtypes]",

@@ -134,9 +134,9 @@ def line_of(row: PhotographFound) -> str:
     if row.refused:
         return f"{name}: refused: {row.refused}"
     line = (
-        f"{name}: {row.stars} stars to V = 6.5 within {row.rms_px:.3f} px and {row.rms_mag:.3f} mag, background chi2"
-        f" {row.background_chi2:.2f}, {row.unexplained} of {row.sources} sources unexplained, DN go as light to the power"
-        f" {row.linearity:.2f}"
+        f"{name}: {row.stars} stars to V = 6.5 within {row.rms_px:.3f} px and {row.rms_mag:.3f}"
+        f" mag, background chi2 {row.background_chi2:.2f}, {row.unexplained} of {row.sources}"
+        f" sources unexplained, DN go as light to the power {row.linearity:.2f}"
     )
     return (
         line

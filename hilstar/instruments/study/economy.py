@@ -241,10 +241,10 @@ def _line(comparison: EffortComparison, load: Load) -> str:
         compared = NOT_JUDGED
     return (
         f"{auto.scene}, {auto.bits} bits, {auto.tolerance_mag:g} mag and {auto.tolerance_px:g} px:"
-        f" {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, {compared};"
-        f" largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.worst_px:.4f} px"
-        f" by the worst of six centroiders ({auto.max_px_fit:.4f} by a PSF fit),"
-        f" {'within' if auto.within else 'OVER'} the tolerance"
+        f" {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms,"
+        f" {compared}; largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag"
+        f" and {auto.worst_px:.4f} px by the worst of six centroiders ({auto.max_px_fit:.4f} by a"
+        f" PSF fit), {'within' if auto.within else 'OVER'} the tolerance"
     )
 
 
@@ -263,8 +263,8 @@ def economy_finding(comparisons: list[EffortComparison]) -> str:
             found.append(f"{np.median(mine):.1f} at {bits}")
     slowest, quickest = (extreme(one.speed_up for one in comparisons) for extreme in (min, max))
     return (
-        f"Auto effort is {', '.join(found)} bits times as fast as full effort ({slowest:.1f} to {quickest:.1f} over all"
-        f" scenes and both tolerances), {within_words(comparisons)}"
+        f"Auto effort is {', '.join(found)} bits times as fast as full effort ({slowest:.1f} to"
+        f" {quickest:.1f} over all scenes and both tolerances), {within_words(comparisons)}"
     )
 
 
@@ -278,7 +278,10 @@ def within_words(comparisons: list[EffortComparison]) -> str:
 
 def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
     """How much faster each scene is at what it needs, and its errors there, in tolerances."""
-    note = "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have no threshold. Tolerances: "
+    note = (
+        "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have"
+        " no threshold. Tolerances: "
+    )
     note += "; ".join(f"{one.name}, {one.mag:g} mag and {one.px:g} px" for one in TOLERANCES) + "."
     title = load.title(economy_finding(comparisons), f"Auto effort is {within_words(comparisons)}")
     kinds = [(bits, tolerance) for bits in BITS for tolerance in TOLERANCES]

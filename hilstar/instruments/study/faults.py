@@ -204,14 +204,16 @@ def run(directory: Path, quick: bool = False) -> Judged:
             max(mine.values(), key=lambda cost: cost.cost_ms),
         )
         found.append(
-            f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on takes {off.cost_ms:+.2f} ms, a"
-            f" false star {star.cost_ms:+.2f} ms; the dearest, {dearest.case}, {dearest.cost_ms:+.1f} ms"
+            f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on"
+            f" takes {off.cost_ms:+.2f} ms, a false star {star.cost_ms:+.2f} ms; the dearest,"
+            f" {dearest.case}, {dearest.cost_ms:+.1f} ms"
         )
     for quantisation in QUANTISATIONS:
         share = spoilt_from(strays, quantisation)
         limit = "no stray light here" if share is None else f"stray light of {share:g} of white"
         found.append(
-            f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from {limit} on"
+            f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from"
+            f" {limit} on"
         )
     return load.judged(found)
 
@@ -241,7 +243,10 @@ def draw_stray(path: Path, strays: list[Stray]) -> None:
         if said
         else "No stray light spoils stars"
     )
-    note = "Solid: 95 % of the stars are within it. Dotted: half of them. A line ends where such a star shows nothing."
+    note = (
+        "Solid: 95 % of the stars are within it. Dotted: half of them. A line ends where such a"
+        " star shows nothing."
+    )
     with chart(path, finding, note=note) as (axes,):
         for name, colour in COLOURS.items():
             light = [one for one in strays if one.quantisation == name and one.share_of_white]
@@ -272,7 +277,10 @@ def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:
     )
     points = f"With false stars a frame takes at most {star.frame_ms:.1f} ms"
     finding = f"{points}, with the dearest fault, {dearest.case}, {dearest.frame_ms:.0f} ms"
-    note = "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run. Medians; 1920 x 1080."
+    note = (
+        "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run."
+        " Medians; 1920 x 1080."
+    )
     title, note = load.title(finding, "Times of frames with each fault"), load.note(note)
     with chart(
         path, title, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2

@@ -241,8 +241,9 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     best = min(usual, key=lambda o: o.held_out_arcsec)
     uncalibrated = ideal_arcsec()
     finding = (
-        f"Uncalibrated stars are off by {uncalibrated:.0f} arcsec rms, by {usual[0].model} {usual[0].stars_rms_arcsec:.0f},"
-        f" by the model that held-out dots choose ({best.model}) {best.stars_rms_arcsec:.2g}"
+        f"Uncalibrated stars are off by {uncalibrated:.0f} arcsec rms, by {usual[0].model}"
+        f" {usual[0].stars_rms_arcsec:.0f}, by the model that held-out dots choose ({best.model})"
+        f" {best.stars_rms_arcsec:.2g}"
     )
     _draw(directory / "geometry", finding, outcomes, uncalibrated)
     lines = []
@@ -313,7 +314,10 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
 def _draw(
     path: Path, finding: str, outcomes: list[CalibrationOutcome], uncalibrated_arcsec: float
 ) -> None:
-    note = f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots"
+    note = (
+        f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames"
+        f" of {USUAL_SIZE[1]} dots"
+    )
     note += f" with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
     with chart(path, finding, panels=2, share_x=False, note=note) as (dots, noise):
         for model, marker, colour in zip(MODELS, MARKERS, SERIES, strict=False):

@@ -404,9 +404,9 @@ def draw(path: Path, limits: Sequence[Limit]) -> None:
     rows = math.ceil(len(limits) / COLUMNS)
     note = (
         f"Blue: the error as measured, largest or rms. Red: the tolerance, {TOLERANCE_MAG:g} mag,"
-        f" {TOLERANCE_PX:g} px, or {two_digits(TOLERANCE_ARCSEC)} arcsec, which is {TOLERANCE_PX:g} px"
-        " of the demo's monitor; the dot is where they meet."
-        " Each axis runs from easy to hard. Places by the plain moment."
+        f" {TOLERANCE_PX:g} px, or {two_digits(TOLERANCE_ARCSEC)} arcsec, which is {TOLERANCE_PX:g}"
+        " px of the demo's monitor; the dot is where they meet. Each axis runs from easy to hard."
+        " Places by the plain moment."
     )
     height_inch = EDGE_INCH + PANEL_INCH * rows
     with chart(

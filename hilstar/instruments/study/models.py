@@ -142,8 +142,9 @@ def catalogue_errors(directory: Path) -> ChartFinding:
     medians = {name: here for name, _, here, _ in rows if name in TABLE_2_3}
     largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
     text = (
-        f"Hipparcos's errors: B-V {medians['sigma_bv_mag']:.4f} mag (thesis: 0.0281), places {medians['sigma_ra_mas']:.2f} and"
-        f" {medians['sigma_dec_mas']:.2f} mas (0.77, 0.64); all of table 2.3 within {largest:.3f}"
+        f"Hipparcos's errors: B-V {medians['sigma_bv_mag']:.4f} mag (thesis: 0.0281), places"
+        f" {medians['sigma_ra_mas']:.2f} and {medians['sigma_dec_mas']:.2f} mas (0.77, 0.64); all"
+        f" of table 2.3 within {largest:.3f}"
     )
     draw_catalogue_errors(directory / "catalogue_errors", text, catalog, medians)
     return ChartFinding("catalogue_errors", text)
@@ -159,9 +160,9 @@ def draw_catalogue_errors(
     facts, against = facts_of(catalog.hip), measured_values(catalog)
     largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
     note = (
-        f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand at"
-        " the top edge. Solid: the figures above them, medians of stars to"
-        f" V = {TABLE_2_3_V_MAG:g} (B-V: the mean of all). Dashed: the thesis's, within {largest:.3f}."
+        f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand"
+        " at the top edge. Solid: the figures above them, medians of stars to V ="
+        f" {TABLE_2_3_V_MAG:g} (B-V: the mean of all). Dashed: the thesis's, within {largest:.3f}."
     )
     layout: dict[str, Any] = {"note": note, "share_x": False, "height_inch": 11.0}
     with chart(path, text, 4, 2, **layout) as panels:
@@ -277,7 +278,10 @@ def passbands(directory: Path) -> ChartFinding:
         f"Vega's spectrum at V = 0 has table 2.5's second fluxes within {100 * off:.1f} %;"
         f" at 350 nm it has {blue:.2f} of the black body of 9602 K"
     )
-    note = f"Vega: CALSPEC, V = {VEGA_V_MAG:g}; both scaled to one mean through V. Passbands: Bessell 1990."
+    note = (
+        f"Vega: CALSPEC, V = {VEGA_V_MAG:g}; both scaled to one mean through V. Passbands: Bessell"
+        " 1990."
+    )
     with chart(directory / "passbands", text, panels=2, note=note) as (upper, lower):
         for (band, curve), colour in zip(
             curves.items(), (PURPLE, BLUE, GREEN, ORANGE, INK), strict=True
@@ -309,11 +313,17 @@ def curves(directory: Path) -> ChartFinding:
     names = ("ccd47-20", "kai-4021", "n-bk7-10mm")
     loaded = {name: load_curve(name, name) for name in names}
     words = {
-        name: f"{c.wavelength_nm[0]:.0f} to {c.wavelength_nm[-1]:.0f} nm, most at {c.wavelength_nm[c.value.argmax()]:.0f}"
+        name: (
+            f"{c.wavelength_nm[0]:.0f} to {c.wavelength_nm[-1]:.0f} nm, most at"
+            f" {c.wavelength_nm[c.value.argmax()]:.0f}"
+        )
         for name, c in loaded.items()
     }
     text = f"The CCD47-20 sees {words['ccd47-20']}; the approximate KAI-4021 {words['kai-4021']}"
-    note = "CCD47-20: ULTRACAM's red arm, not the thesis's midband coating. KAI-4021: recalled, not digitised. Lines: V."
+    note = (
+        "CCD47-20: ULTRACAM's red arm, not the thesis's midband coating. KAI-4021: recalled, not"
+        " digitised. Lines: V."
+    )
     nm = np.arange(300.0, 1101.0, 2.0)
     kelvin = (3000.0, 5000.0, 9000.0, 30_000.0)
     bodies = [blackbody_exitance_w_m2_m(nm, each) for each in kelvin]
@@ -365,10 +375,14 @@ def detector_laws(directory: Path) -> ChartFinding:
     }
     at = {name: float(values[kelvin == COLD_K][0]) for name, values in dark.items()}
     text = (
-        f"Of 203 e-/s at 293 K (table 4.2) {COLD_K:.0f} K leaves {at['e2v AIMO']:.0f} by e2v's AIMO law,"
-        f" {at['e2v NIMO']:.0f} by its NIMO law, {at['Arrhenius, 0.56 eV']:.0f} by Arrhenius with half of silicon's gap"
+        f"Of 203 e-/s at 293 K (table 4.2) {COLD_K:.0f} K leaves {at['e2v AIMO']:.0f} by e2v's AIMO"
+        f" law, {at['e2v NIMO']:.0f} by its NIMO law, {at['Arrhenius, 0.56 eV']:.0f} by Arrhenius"
+        " with half of silicon's gap"
     )
-    note = "e2v's constants were seen in public code, not on a data sheet. Read noise: 2 e- at 1 MHz, white and 1/f noise."
+    note = (
+        "e2v's constants were seen in public code, not on a data sheet. Read noise: 2 e- at 1 MHz,"
+        " white and 1/f noise."
+    )
     with chart(directory / "detector_laws", text, panels=2, note=note, share_x=False) as (
         upper,
         lower,
@@ -407,12 +421,12 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
     total = {name: float(np.trapezoid(values, nm)) for name, values in spectra.items()}
     sun, far, near = total.values()
     text = (
-        f"Zodiacal light of V = {ZODIACAL_V_MAG:g} has {far:.1f} photons/s/m2/arcsec2 90 degrees from the Sun (330 to"
-        f" 1100 nm), {near:.1f} at 30 degrees, {sun:.1f} as sunlight"
+        f"Zodiacal light of V = {ZODIACAL_V_MAG:g} has {far:.1f} photons/s/m2/arcsec2 90 degrees"
+        f" from the Sun (330 to 1100 nm), {near:.1f} at 30 degrees, {sun:.1f} as sunlight"
     )
     note = (
-        f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The WFC3"
-        " handbook's spectrum, V = 22.15, gives 101.6."
+        f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The"
+        " WFC3 handbook's spectrum, V = 22.15, gives 101.6."
     )
     with chart(directory / "zodiacal", text, note=note) as (axes,):
         for (name, values), colour in zip(spectra.items(), SERIES, strict=False):
@@ -482,15 +496,18 @@ def spectra(directory: Path) -> ChartFinding:
     late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
     of_late = {key: np.percentile(100 * np.abs(error[late]), 95) for key, error in errors.items()}
     text += "; late M giants (95 %), " + "; ".join(
-        f"{SENSORS[sensor].split()[0]} {of_late[sensor, HELD_OUT]:.0f} % by V-I, {of_late[sensor, BY_TYPE]:.1f} % by MK type"
-        f" (others {figures[sensor, BY_TYPE][1]:.1f} %)"
+        f"{SENSORS[sensor].split()[0]} {of_late[sensor, HELD_OUT]:.0f} % by V-I,"
+        f" {of_late[sensor, BY_TYPE]:.1f} % by MK type (others {figures[sensor, BY_TYPE][1]:.1f} %)"
         for sensor in SENSORS
     )
     finding = (
-        f"Real spectra by V-I give the electron rate within {real:.1f} % for 95 % of stars to V-I = {MAX_RELIABLE_VI_MAG:g},"
-        f" black bodies by B-V within {body:.0f} %"
+        f"Real spectra by V-I give the electron rate within {real:.1f} % for 95 % of stars to V-I ="
+        f" {MAX_RELIABLE_VI_MAG:g}, black bodies by B-V within {body:.0f} %"
     )
-    note = f"A mark a Pickles spectrum, each held out in turn; {(~sure).sum()} are redder than the dashed line."
+    note = (
+        f"A mark a Pickles spectrum, each held out in turn; {(~sure).sum()} are redder than the"
+        " dashed line."
+    )
     with chart(directory / "spectra", finding, panels=2, note=note) as panels:
         for axes, sensor in zip(panels, SENSORS, strict=True):
             named = [(name, error) for (owner, name), error in errors.items() if owner == sensor]
@@ -532,8 +549,9 @@ def zero_points(directory: Path) -> ChartFinding:
     mag = {sensor: magnitude(rate / rate[0]) for sensor, rate in rates.items()}
     base, cost = rates["ccd47-20"], mag["ccd47-20"]
     text = (
-        f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux (CCD47-20, 30 mm),"
-        f" {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by the IAU's bolometric zero point"
+        f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux"
+        f" (CCD47-20, 30 mm), {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by"
+        " the IAU's bolometric zero point"
     )
     note = f"A black body of {REFERENCE_TEMPERATURE_K:.0f} K, V = 0, behind {APERTURE_MM:g} mm."
     with chart(directory / "zero_points", text, panels=2, note=note) as (upper, lower):
@@ -591,8 +609,8 @@ def temperature_scales(directory: Path) -> ChartFinding:
     zero, wang = int(np.searchsorted(bv, 0.0)), kelvin["wang2021"]
     step_k = wang[zero - 1] - wang[zero]
     text = (
-        f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / wang[zero - 1]:.1f} %) at B-V = 0; half of"
-        " Hipparcos to V = 7.5 (95 %) is within "
+        f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / wang[zero - 1]:.1f} %) at B-V = 0;"
+        " half of Hipparcos to V = 7.5 (95 %) is within "
         + ", ".join(
             f"{half:.3f} ({most:.2f}) mag by {name}" for name, (half, most) in within.items()
         )
@@ -602,7 +620,10 @@ def temperature_scales(directory: Path) -> ChartFinding:
         f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within "
         + ", ".join(f"{half:.3f} mag by {name}" for name, (half, _) in within.items())
     )
-    note = "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, + is fainter."
+    note = (
+        "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, +"
+        " is fainter."
+    )
     groups = {"k": kelvin, "percent": percent, "mag": mag}
     with chart(
         directory / "temperature_scales", f"{finding} of Torres 2010", panels=3, note=note
@@ -660,9 +681,9 @@ def choices(directory: Path) -> ChartFinding:
     )
     finding = choices_finding(paid)
     note = (
-        f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5 to"
-        " 95 % of them. M giants share the B-V of K giants, and are up to"
-        f" {-np.nanmin(low):.1f} mag brighter than the black body. + is fainter; CCD47-20."
+        f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5"
+        f" to 95 % of them. M giants share the B-V of K giants, and are up to {-np.nanmin(low):.1f}"
+        " mag brighter than the black body. + is fainter; CCD47-20."
     )
     with chart(directory / "choices", finding, panels=2, note=note) as (upper, lower):
         for (name, mag), colour in zip(cost.items(), SERIES, strict=False):

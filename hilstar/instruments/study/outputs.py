@@ -202,7 +202,10 @@ def _figure(path: Path, scene: Scene, outputs: Outputs) -> None:
     finding = f"{scene.title}: {int(outputs.inside.sum())} stars, {saturated or 'none'} saturated"
     if np.isfinite(kelvin).any():
         finding += f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
-    note = "Stars count from the brightest; lines: means of all whose light reaches the image. One stretch for all images."
+    note = (
+        "Stars count from the brightest; lines: means of all whose light reaches the image. One"
+        " stretch for all images."
+    )
     with chart(path, finding, 3, 3, note=note, share_x=False, height_inch=HEIGHT_INCH) as panels:
         centroids, magnitudes, temperatures = panels[:3]
         _draw_centroids(centroids, outputs)

@@ -112,8 +112,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     )
     hold = next(o for o in usual if o.method == "hold")
     finding = (
-        f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is off by "
-        f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
+        f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is"
+        f" off by {default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
     _draw(directory / "prediction", finding, outcomes, load)
     cells, frequencies = (
@@ -133,12 +133,14 @@ def run(directory: Path, quick: bool = False) -> Judged:
         for packets in ("with rates", "without rates")
     )
     told = (
-        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is nearer than one predicted by"
+        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
+        " nearer than one predicted by"
         f' {USUAL_MS} ms; "auto" is within {auto_times(shaken_by):.1f} times the better of both'
     )
     _draw_shaken(directory / "prediction_jitter", told, shaken_by)
     lines = (
-        f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.attitude_us:.0f} us per attitude"
+        f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
+        f" {o.attitude_us:.0f} us per attitude"
         for o in usual
     )
     return load.judged([finding, *lines, told])
@@ -257,7 +259,10 @@ def _outcome(
 
 def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
-    note = f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the time of one attitude."
+    note = (
+        f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the"
+        " time of one attitude."
+    )
     with chart(path, finding, panels=2, share_x=False, note=load.note(note)) as (latency, rate):
         for name, marker, colour in zip(
             dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False
@@ -284,8 +289,9 @@ def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Loa
 
 def _draw_shaken(path: Path, finding: str, found: list[Shaken]) -> None:
     note = (
-        f"Packets at {USUAL_HZ} Hz, the newest {USUAL_MS} ms old at light on the mean; a vibration of {SHAKEN_ARCSEC:g} arcsec"
-        f" beside a turn of {math.degrees(SHAKEN_TURN_RAD_S):g} deg/s. Error and amplitude as shares of the vibration's own."
+        f"Packets at {USUAL_HZ} Hz, the newest {USUAL_MS} ms old at light on the mean; a vibration"
+        f" of {SHAKEN_ARCSEC:g} arcsec beside a turn of {math.degrees(SHAKEN_TURN_RAD_S):g} deg/s."
+        " Error and amplitude as shares of the vibration's own."
     )
     with chart(path, finding, panels=2, columns=2, note=note, share_y="row") as axes:
         for column, packets in enumerate(("with rates", "without rates")):

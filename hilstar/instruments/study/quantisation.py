@@ -76,15 +76,21 @@ def run(directory: Path, quick: bool = False) -> Judged:
     coarsest = codes.BITS[0]
     rounded, exact = (faintest[coarsest, name] for name in ("round", "exact"))
     left = ", ".join(
-        f"{kind} {exact.axis_rms_px(kind) / rounded.axis_rms_px(kind):.2f} ({exact.axis_rms_px(kind):.4f} px)"
+        f"{kind} {exact.axis_rms_px(kind) / rounded.axis_rms_px(kind):.2f}"
+        f" ({exact.axis_rms_px(kind):.4f} px)"
         for kind in FAMILY
     )
     ms = ", ".join(f"{way.method} {times[10, way.name]:.1f} ms" for way in codes.WAYS[:4])
     lines = [
         *(_summary(bits, found, mags) for bits in codes.BITS),
-        f"{coarsest} bits, {codes.AIMS[coarsest][1]:g} magnitudes under white: of the error of round (rms along an axis) exact"
-        f" leaves, by each centroider, {left}",
-        f"{codes.STARS} stars, {codes.FRAME_PX[0]} x {codes.FRAME_PX[1]}, 10 bits, from light to levels in memory: {ms}",
+        (
+            f"{coarsest} bits, {codes.AIMS[coarsest][1]:g} magnitudes under white: of the error of"
+            f" round (rms along an axis) exact leaves, by each centroider, {left}"
+        ),
+        (
+            f"{codes.STARS} stars, {codes.FRAME_PX[0]} x {codes.FRAME_PX[1]}, 10 bits, from light"
+            f" to levels in memory: {ms}"
+        ),
         codes.study_frames(directory, quick),
     ]
     return load.judged(lines)
@@ -123,22 +129,32 @@ def _summary(bits: int, found: Found, mags: FloatArray) -> str:
     others = ", ".join(f"{way.method} {worst[way]}" for way in codes.WAYS[:3])
     half_step_px = srgb_response(bits).half_step * USUAL_PSF.peak_share / flux_ratio(limit)
     return (
-        f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {codes.AIM_PX:g} px): largest errors, places by a PSF"
-        f" fit, of exact {worst[codes.WAYS[3]]}, with bit stealing {worst[codes.WAYS[5]]}; {others} (over {EXPOSURE_FRAMES}"
-        f" frames). Half the smallest step of light moves a centroid by {half_step_px:.3f} px along each axis"
+        f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {codes.AIM_PX:g} px):"
+        f" largest errors, places by a PSF fit, of exact {worst[codes.WAYS[3]]}, with bit stealing"
+        f" {worst[codes.WAYS[5]]}; {others} (over {EXPOSURE_FRAMES} frames). Half the smallest step"
+        f" of light moves a centroid by {half_step_px:.3f} px along each axis"
     )
 
 
 def _worst(errors: list[StarErrors], mags: FloatArray, limit_mag: float) -> str:
     within = [e for e, mag in zip(errors, mags, strict=True) if mag <= limit_mag]
-    return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.max_px(codes.JUDGE) for e in within):.3f} px"
+    return (
+        f"{max(e.flux_max_mag for e in within):.3f} mag and"
+        f" {max(e.max_px(codes.JUDGE) for e in within):.3f} px"
+    )
 
 
 def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
     bits, limit = codes.BITS[1], codes.AIMS[codes.BITS[1]][1]
     exact, rounded = (_worst(found[bits, name], mags, limit) for name in ("exact", "round"))
-    finding = f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with exact, {rounded} with round"
-    note = "Largest errors over sub-pixel phases, sRGB; places by a PSF fit. Dotted: with bit stealing."
+    finding = (
+        f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with"
+        f" exact, {rounded} with round"
+    )
+    note = (
+        "Largest errors over sub-pixel phases, sRGB; places by a PSF fit. Dotted: with bit"
+        " stealing."
+    )
     with chart(path, finding, len(codes.BITS), 2, note=note, share_y="col") as grid:
         for bits, flux, place in zip(codes.BITS, grid[::2], grid[1::2], strict=True):
             aim_mag, limit = codes.AIMS[bits]
@@ -167,16 +183,20 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
 
 def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
     left = {
-        (bits, kind): faintest[bits, "exact"].axis_rms_px(kind)
-        / faintest[bits, "round"].axis_rms_px(kind)
+        (bits, kind): (
+            faintest[bits, "exact"].axis_rms_px(kind) / faintest[bits, "round"].axis_rms_px(kind)
+        )
         for bits in codes.BITS
         for kind in FAMILY
     }
     finding = (
-        f"Whichever centroider the tracker has, exact leaves {min(left.values()):.2f} to {max(left.values()):.2f}"
-        " of the error that round makes at the faint end"
+        f"Whichever centroider the tracker has, exact leaves {min(left.values()):.2f} to"
+        f" {max(left.values()):.2f} of the error that round makes at the faint end"
     )
-    note = "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of the error of round."
+    note = (
+        "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of"
+        " the error of round."
+    )
     with chart(
         path, finding, 1, len(codes.BITS), note=note, share_x=True, share_y=True, height_inch=3.6
     ) as grid:
@@ -211,7 +231,10 @@ def _draw_times(
     load: Load,
 ) -> None:
     width, height = codes.FRAME_PX
-    note = f"{codes.STARS} stars, {width} x {height}. Circles, squares, triangles: 8, 10 and 12 bits, at the faint end."
+    note = (
+        f"{codes.STARS} stars, {width} x {height}. Circles, squares, triangles: 8, 10 and 12 bits,"
+        " at the faint end."
+    )
     ms = {way.name: times[codes.BITS[1], way.name] for way in codes.WAYS}
     took = f"exact takes {ms['exact']:.1f} ms and round {ms['round']:.1f} ms"
     finding = load.title(f"From light to codes in memory {took}, on {codes.BITS[1]} bits")

@@ -42,7 +42,10 @@ TICKS_K = (3000, 5000, 9000, 15_000, 30_000, 50_000)
 TEMPERATURES = 400
 SAID_OF_THESIS = {  # section 5.4, of figures 5.19 and 5.22
     "ccd47-20": " (thesis: 15 % to 5 %)",
-    "kai-4021": "; RAPP1 at 50000 K is {:.2f}, and {:.2f} with any curve from 300 to 1050 nm (thesis: the CCD47-20's)",
+    "kai-4021": (
+        "; RAPP1 at 50000 K is {:.2f}, and {:.2f} with any curve from 300 to 1050 nm (thesis: the"
+        " CCD47-20's)"
+    ),
 }
 RATIOS = ("irradiance", "photons", "electrons")
 BENCH_FILES = (
@@ -118,14 +121,14 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
     coolest, cool, hot, hottest = _quoted(kelvin, ratios["energy"])
     text = (
         f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the"
-        f" average one at 3000 K,"
+        " average one at 3000 K,"
         f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by"
         f" {100 * (hottest - 1):+.1f} %"
         + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
     )
     title = (
         f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the"
-        f" average model,"
+        " average model,"
         f" one of 5000 K {cool:.2f} times"
     )
     _draw(directory / f"rapp_{sensor}", title, optics, ratios, "energy")
@@ -148,7 +151,7 @@ def bench_rapp(
     coolest, cool, hot, hottest = _quoted(kelvin, ratios[weighting])
     text = (
         f"By {file.path.name} a black body of 3000 K gives {coolest:.2f} times the electrons of"
-        f" the average model, one of"
+        " the average model, one of"
         f" 5000 K {cool:.2f}, 9000 K {hot:.2f}, 50000 K {hottest:.2f}"
     )
     stars, ratio = _star_ratios(file)
@@ -188,7 +191,8 @@ def _star_ratios(file: BenchFile) -> tuple[Stars, FloatArray]:
     )
     if not len(spectral):
         raise InputError(
-            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude"
+            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger"
+            " magnitude"
         )
     return spectral, spectral.electrons_per_s / average.electrons_per_s
 
@@ -221,7 +225,10 @@ def _draw(
     kelvin = _temperatures_k()
     (dotted,) = set(WEIGHTINGS) - {solid}
     low_nm, high_nm = optics.range_nm
-    note = f"DGS over AGS at one V, {low_nm:.0f} to {high_nm:.0f} nm. Solid: {solid} weighting; dotted: {dotted}."
+    note = (
+        f"DGS over AGS at one V, {low_nm:.0f} to {high_nm:.0f} nm. Solid: {solid} weighting;"
+        f" dotted: {dotted}."
+    )
     panels = 1 if stars is None else 2
     with chart(path, title, panels, note=note) as axes:
         for k, (name, colour) in enumerate(zip(RATIOS, SERIES, strict=False)):

@@ -70,7 +70,10 @@ def star_density(directory: Path) -> ChartFinding:
         f" {high:.1f} in 90 % of the sky:"
         " most along the Milky Way"
     )
-    note = f"{len(catalog)} stars with V and B-V. Cells of equal area, {SKY_DEG2 / stars.size:.0f} square degrees each."
+    note = (
+        f"{len(catalog)} stars with V and B-V. Cells of equal area, {SKY_DEG2 / stars.size:.0f}"
+        " square degrees each."
+    )
     with chart(directory / "star_density", text, note=note, height_inch=4.2) as (axes,):
         image = axes.imshow(
             density,
@@ -105,11 +108,14 @@ def frames(directory: Path) -> ChartFinding:
     error = float(np.abs(vectors[inside] @ equation_2_3(*angles) - cam[inside]).max())
     text = (
         f"{int(inside.sum())} stars of Orion, in the celestial frame about +y, stand about +z in"
-        f" the camera's;"
+        " the camera's;"
         f" equation 2.3 and hilstar's quaternion agree to {error:.0e}"
     ).replace("e-", " x 10^-")
     count = int(inside.sum())
-    finding = f"{count} stars of Orion stand about +y in the celestial frame, and about +z in the camera's"
+    finding = (
+        f"{count} stars of Orion stand about +y in the celestial frame, and about +z in the"
+        " camera's"
+    )
     note = "Unit vectors. North is up in both, as roll is 0; the camera's y points down."
     with chart(directory / "frames", finding, 1, 2, note=note, share_x=False, height_inch=4.4) as (
         sky,
@@ -171,7 +177,10 @@ def sun(directory: Path) -> ChartFinding:
     quoted = ", ".join(
         f"{ratio:.2f} at {nm:.0f} nm" for ratio, nm in zip(share.tolist(), QUOTED_NM, strict=True)
     )
-    text = f"A star of the Sun's type ({SUN_TYPE}) over the black body of {SUN_TEMPERATURE_K:.0f} K, scaled in V: {quoted}"
+    text = (
+        f"A star of the Sun's type ({SUN_TYPE}) over the black body of {SUN_TEMPERATURE_K:.0f} K,"
+        f" scaled in V: {quoted}"
+    )
     note = (
         "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
     )
@@ -200,7 +209,7 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
     blue, red = np.interp([350.0, 5000.0], nm, flux / body)
     text = (
         f"From 1 to 5 micrometres Vega's light falls by {falls:.0f} times; it has {blue:.2f} of"
-        f" the black body's at 350 nm,"
+        " the black body's at 350 nm,"
         f" {red:.2f} at 5 micrometres"
     )
     note = f"CALSPEC, scaled to V = 0. Black body: {REFERENCE_TEMPERATURE_K:.0f} K, scaled in V."

@@ -222,7 +222,10 @@ def measured(step: Trials, budget_s: float) -> Trials:
             if best.quartiles_ms[1] >= found[own].quartiles_ms[0]
             else ""
         )
-        why = f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise}; {step.why_default}"
+        why = (
+            f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise};"
+            f" {step.why_default}"
+        )
         found[own] = replace(found[own], beaten=why)
     return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms), load=load)
 

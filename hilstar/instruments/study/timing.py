@@ -163,8 +163,8 @@ def draw_stripes(path: Path, points: list[StripePoint]) -> str:
         f" {max(off, ROUNDING):.0e}"
     )
     note = (
-        f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each, the top row first."
-        " Dots: glow on the virtual tracker's rows. Lines: foretold."
+        f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us"
+        " each, the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
     )
     with chart(path, finding, note=note) as (axes,):
         for case, colour in zip(STRIPE_CASES, SERIES, strict=False):
@@ -466,8 +466,8 @@ def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
     for point in points:
         cases.setdefault(TimingCase(point.refreshes, point.lit), []).append(point)
     finding = (
-        f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from their phase,"
-        f" within {_off_arcsec(points):.2g} arcsec rms"
+        f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from"
+        f" their phase, within {_off_arcsec(points):.2g} arcsec rms"
     )
     _draw(directory / "beat", finding, cases)
     lines = []
@@ -475,8 +475,8 @@ def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
         found = beat(case.exposures)
         lines.append(
             f"{case.words}: up to {max(abs(p.off_arcsec) for p in mine):.3g} arcsec"
-            f" ({(found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S:.3g} foretold over all phases) and"
-            f" {max(abs(p.light_mag) for p in mine):.2g} mag ({found.worst_mag:.2g});"
+            f" ({(found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S:.3g} foretold over all phases)"
+            f" and {max(abs(p.light_mag) for p in mine):.2g} mag ({found.worst_mag:.2g});"
             f" {_off_arcsec(mine):.2g} arcsec rms off that ({len(mine)} stars)"
         )
     return [finding, *lines]
@@ -489,7 +489,10 @@ def _off_arcsec(points: list[BeatPoint]) -> float:
 
 def _draw(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) -> None:
     phases = np.linspace(0, 1, 801)
-    note = "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit have no beat."
+    note = (
+        "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit"
+        " have no beat."
+    )
     with chart(path, finding, panels=2, note=note) as (place, light):
         for (case, mine), colour in zip(cases.items(), SERIES, strict=False):
             foretold = seen_at(case.exposures, phases)
@@ -587,8 +590,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     write_records(directory / "timing.csv", outcomes)
     finding = draw(directory / "timing", outcomes, load)
     lines = [
-        f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.flux_rms_mag:.2g} mag rms,"
-        f" {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
+        f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
+        f" {o.flux_rms_mag:.2g} mag rms, {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
         for o in outcomes
         if o.rate_deg_s == QUICK_RATES_DEG_S[0]
     ]
@@ -607,10 +610,13 @@ def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:
     at = {(o.way, o.rate_deg_s): o for o in outcomes}
     plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))
     finding = (
-        f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction alone,"
-        f" and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
+        f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction"
+        f" alone, and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
     )
-    note = "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to the one above it."
+    note = (
+        "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way"
+        " adds to the one above it."
+    )
     with chart(path, finding, panels=2, note=load.note(note), heights=(1.5, 1)) as (error, cost):
         for way, marker in zip(WAYS, "osd^", strict=True):
             mine = [o for o in outcomes if o.way == way]

@@ -464,9 +464,11 @@ class Comparison:
         return GlowFit(
             assumed_e_per_s_px=on_screen_median(self.twin.assumed_glow_e_per_s),
             seen_e_per_s_px=on_screen_median(self.twin.glow_e_per_s),
-            limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px
-            if given is None
-            else given,
+            limit_e_per_s_px=(
+                BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px
+                if given is None
+                else given
+            ),
         )
 
     def _stars(

@@ -103,7 +103,10 @@ def propose(
     `on_try` hears how many changes have been tried. Raises MachineError where the twin does.
     """
     if not codes_at_fault(verdict):
-        cannot = f"the codes are within the limits, and no key of the light mends the rest: {verdict.reasons[0]}"
+        cannot = (
+            "the codes are within the limits, and no key of the light mends the rest:"
+            f" {verdict.reasons[0]}"
+        )
         return BenchProposal((), None, (), 0, cannot)
     rest = _not_the_codes(verdict)
     if rest is not None:
@@ -288,7 +291,10 @@ def _what_fails(verdict: Verdict) -> str:
     ]
     if not failing:
         return f"at best: {verdict.reasons[0]}"
-    return f"{monitor.bits} bits cannot show stars of V {failing[0]['v_from']} to {failing[-1]['v_to']} within the limits"
+    return (
+        f"{monitor.bits} bits cannot show stars of V {failing[0]['v_from']} to"
+        f" {failing[-1]['v_to']} within the limits"
+    )
 
 
 def proposal_lines(file: BenchFile, proposal: BenchProposal) -> list[str]:
@@ -351,4 +357,7 @@ def _figures(verified: Verified) -> str:
         if flux is not None and centroid is not None
         else ""
     )
-    return f"{at_95}{verified.stars} stars, {verified.lost} lost, {verified.clipped} clipped, {verified.not_shown} not shown"
+    return (
+        f"{at_95}{verified.stars} stars, {verified.lost} lost, {verified.clipped} clipped,"
+        f" {verified.not_shown} not shown"
+    )

@@ -156,7 +156,10 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     rest = f"{summary['lost']} lost, {summary['blended']} blended, {summary['clipped']} clipped"
     rest += f", {summary['not_shown']} not shown, {summary['at_edge']} at edge"
     rest += f", {summary['summed']} part of a blend" if summary["summed"] else ""
-    centroid = f"{three(summary['centroid_error_px'])} px, {three(summary['centroid_error_arcsec'])} arcsec"
+    centroid = (
+        f"{three(summary['centroid_error_px'])} px, {three(summary['centroid_error_arcsec'])}"
+        " arcsec"
+    )
     each = ", ".join(
         f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items()
     )
@@ -171,7 +174,10 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             if summary["channels_mag"]
             else []
         ),
-        f"{'with detector noise':20}{three(noisy['flux_mag'])} mag, {three(noisy['centroid_px'])} px",
+        (
+            f"{'with detector noise':20}{three(noisy['flux_mag'])} mag,"
+            f" {three(noisy['centroid_px'])} px"
+        ),
         *(
             f"{'V {v_from} to {v_to}'.format(**row):>17}   {row['flux_error_mag'].rms:.4f} mag rms,"
             f" {row['centroid_error_px'].rms:.4f} px rms, {row['stars']} stars"
@@ -212,7 +218,10 @@ def _draw_errors(path: Path, verdict: Verdict) -> None:
     errors, limits = verdict.errors, verdict.measured.config.verify
     v_mag, flux, centroid = errors.of("v_mag"), errors.of("flux_mag"), errors.centroid_px()
     word = "passes" if verdict.passed else "does not pass"
-    finding = f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within {p95(centroid):.3f} px, for 95 % of stars"
+    finding = (
+        f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within"
+        f" {p95(centroid):.3f} px, for 95 % of stars"
+    )
     note = f"Each point is one of {len(v_mag)} stars. The limit is for 95 % of them."
     with chart(path, finding, 2, note=note) as axes:
         for axis, values, limit, label in (
@@ -243,7 +252,10 @@ def _draw_errors(path: Path, verdict: Verdict) -> None:
 def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int]) -> None:
     x, y, dx, dy = (errors.of(name) for name in ("x_px", "y_px", "dx_px", "dy_px"))
     longest, arrow_px = max(p95(np.hypot(dx, dy)), 1e-9), ARROW_SHARE * resolution_px[0]
-    finding = f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are lost"
+    finding = (
+        f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are"
+        " lost"
+    )
     note = f"Arrows are enlarged {arrow_px / longest:.0f} times." + (
         " Red crosses: lost stars." if errors.lost else ""
     )

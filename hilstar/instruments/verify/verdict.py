@@ -107,12 +107,16 @@ def _none(measured: Measured) -> str:
     """Why no star could be measured: too few in view, or none that can be."""
     few, fields = measured.stars_a_field, measured.field_count
     faintest = measured.config.sky.faintest_v_mag
-    text = f"no star could be measured: none of {fields} fields has one that is shown, unclipped and alone"
+    text = (
+        f"no star could be measured: none of {fields} fields has one that is shown, unclipped and"
+        " alone"
+    )
     if few * fields > MIN_EXPECTED:
         return text
     return (
-        f"{text}; {few:.2g} stars to V = {faintest:g} are in the tracker's field on average: write a larger"
-        " [sky] faintest_v_mag, or a [sky] catalogue with fainter stars, or let `hilstar verify` look at more --fields"
+        f"{text}; {few:.2g} stars to V = {faintest:g} are in the tracker's field on average: write"
+        " a larger [sky] faintest_v_mag, or a [sky] catalogue with fainter stars, or let `hilstar"
+        " verify` look at more --fields"
     )
 
 
@@ -129,10 +133,16 @@ def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
         return []
     cause = "look at focal lengths, pixel pitches and q_cam_to_mon"
     if tally.vanished > MIN_SHARE * lost:
-        cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
+        cause = (
+            "they are too faint to be seen: look at the monitor's response, and at what the codes"
+            " leave of faint stars"
+        )
     for mirror, count in tally.mirrored.items():
         if count > MIN_SHARE * looked_for:
-            cause = f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at how it is mounted"
+            cause = (
+                f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them:"
+                " look at how it is mounted"
+            )
     return [
         f"{lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"
     ]
@@ -178,13 +188,15 @@ def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
     if fit.tilt_px > limit_px:
         a, b = (math.degrees(angle) for angle in fit.tilt_rad)
         found.append(
-            f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes, {fit.tilt_px:.2f} px: {cure}"
+            f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes,"
+            f" {fit.tilt_px:.2f} px: {cure}"
         )
     if fit.distortion_px > limit_px:
         found.append(f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}")
     if fit.left_px > limit_px:
         found.append(
-            f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor distortion"
+            f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor"
+            " distortion"
         )
     return found
 
@@ -198,7 +210,10 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
     seen, alone = p95(np.abs(errors.of("flux_mag"))), p95(np.abs(errors.of("codes_mag")))
     if seen > limit:
         response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
-        cause = ": light does not follow the codes as assumed, look at the monitor's response and uniformity"
+        cause = (
+            ": light does not follow the codes as assumed, look at the monitor's response and"
+            " uniformity"
+        )
         found.append(
             f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}"
         )
@@ -220,8 +235,9 @@ def _black(measured: Measured) -> list[str]:
     if abs(glow.seen_e_per_s_px - glow.assumed_e_per_s_px) <= glow.limit_e_per_s_px:
         return []
     return [
-        f"the screen's black gives {glow.seen_e_per_s_px:.4g} e-/s in a tracker pixel where {glow.assumed_e_per_s_px:.4g} are"
-        f" assumed (limit {glow.limit_e_per_s_px:.3g}): calibrate the black level"
+        f"the screen's black gives {glow.seen_e_per_s_px:.4g} e-/s in a tracker pixel where"
+        f" {glow.assumed_e_per_s_px:.4g} are assumed (limit {glow.limit_e_per_s_px:.3g}): calibrate"
+        " the black level"
     ]
 
 
@@ -237,13 +253,15 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
     beside = glass is not None and px > limits.centroid_px and glass.px > MIN_SHARE * px
     if glass is not None and (beside or (mag > limits.flux_mag and glass.mag > MIN_SHARE * mag)):
         return [
-            f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the glass of"
-            f" [tracker.optics] psf has centroids {glass.px:.3f} px beside their chief rays and light {glass.mag:.3f} mag under"
-            f" the axis's at 95 %{CURE if limits.centroider != 'psf' else ''}"
+            f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue"
+            f" at 95 %: the glass of [tracker.optics] psf has centroids {glass.px:.3f} px beside"
+            f" their chief rays and light {glass.mag:.3f} mag under the axis's at 95"
+            f" %{CURE if limits.centroider != 'psf' else ''}"
         ]
     return [
-        f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the tracker's PSF is too"
-        " narrow or too wide for its pixels, or lies beside its chief ray, so that nothing can be said about the display"
+        f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95"
+        " %: the tracker's PSF is too narrow or too wide for its pixels, or lies beside its chief"
+        " ray, so that nothing can be said about the display"
     ]
 
 
@@ -266,13 +284,16 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
         else []
     )
     ways += [
-        "more bits"
-        if all(c.is_formula for c in calibrations)
-        else "a monitor calibrated on more bits"
+        (
+            "more bits"
+            if all(c.is_formula for c in calibrations)
+            else "a monitor calibrated on more bits"
+        )
     ]
     ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]
     return [
-        f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"
+        f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or"
+        f" {ways[-1]}"
     ]
 
 

@@ -318,7 +318,8 @@ class _Reader(LensFileReader):
         smallest_radius = MIN_RADIUS_OF_THICKNESS * abs(self._finite_thickness(surface))
         if not is_stated and abs(curvature) * smallest_radius > 1:
             surface.line.refuse(
-                f"at {surface.label} has {curvature:g}, which without RDM is a curvature (a radius of {1 / curvature:.3g})",
+                f"at {surface.label} has {curvature:g}, which without RDM is a curvature (a radius"
+                f" of {1 / curvature:.3g})",
                 "write RDM Y where these numbers are radii, RDM N where they are curvatures",
             )
 

@@ -235,8 +235,9 @@ class GlassPsf(SampledPsf):
         least = float((weights @ stamps.light).min())
         if least < 1 - MAX_UNEVEN:
             raise InputError(
-                f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and more at others: sample it more "
-                "finely, or write PIXINT = F where no pixel is integrated in it"
+                f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and"
+                " more at others: sample it more finely, or write PIXINT = F where no pixel is"
+                " integrated in it"
             )
 
     @cached_property
@@ -271,7 +272,8 @@ class GlassPsf(SampledPsf):
         )
         if side > MAX_FOOTPRINT_PX:
             raise InputError(
-                f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what lies further out"
+                f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what"
+                " lies further out"
             )
         return side
 

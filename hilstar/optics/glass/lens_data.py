@@ -274,8 +274,8 @@ class LensPrescription:
         if self.pupil / 2 * abs(first.curvature_per_mm) * math.sqrt(1 + first.conic) >= 1:
             radius = f"a radius of {1 / first.curvature_per_mm:.4g} mm"
             raise InputError(
-                f"{first.label} has {radius}, and the pupil is {self.pupil:.4g} mm wide: no ray at its"
-                " edge meets it; are radii and curvatures, or units, mixed up?"
+                f"{first.label} has {radius}, and the pupil is {self.pupil:.4g} mm wide: no ray at"
+                " its edge meets it; are radii and curvatures, or units, mixed up?"
             )
 
 

@@ -185,8 +185,8 @@ def _material(surface: LensSurface, wavelengths_um: Sequence[float]) -> tuple[An
         if not file.shortest_um <= um <= file.longest_um:
             raise InputError(
                 f"{surface.label}: {glass.name} is known from {file.shortest_um:g} to"
-                f" {file.longest_um:g} um, and the lens is for {um:g} um; write a wavelength within,"
-                " or another glass"
+                f" {file.longest_um:g} um, and the lens is for {um:g} um; write a wavelength"
+                " within, or another glass"
             )
     from optiland.materials.material_file import MaterialFile
 

@@ -227,7 +227,8 @@ class _LensRays:
         tangents, places = self.chiefs(edge, self.primary_um)
         if not np.isfinite(places).all():
             raise InputError(
-                "the chief ray of its field's middle is lost; is a surface tilted too far, or its aperture beside it?"
+                "the chief ray of its field's middle is lost; is a surface tilted too far, or its"
+                " aperture beside it?"
             )
         # A lens with one field, on the axis, has no direction in which its image could be turned
         # round.
@@ -254,9 +255,12 @@ class _LensRays:
             fields[:, 0], fields[:, 1], none, none, um
         )
         tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
-        return tangents, self.at_image(
-            self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um)
-        )[0].T
+        return (
+            tangents,
+            self.at_image(self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um))[
+                0
+            ].T,
+        )
 
     def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
         """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
@@ -332,7 +336,8 @@ def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
         is_diagonal = bool(point.x and point.y)
         if point.is_vignetted and (beside_shift or (is_diagonal and not is_even)):
             raise InputError(
-                f"its field at {point.x:g}, {point.y:g} is vignetted along neither x nor y; write apertures of surfaces instead"
+                f"its field at {point.x:g}, {point.y:g} is vignetted along neither x nor y; write"
+                " apertures of surfaces instead"
             )
         rows.append((radius, beside, along, along_shift * sign))
     return np.array(sorted(rows)).T

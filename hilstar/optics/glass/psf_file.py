@@ -123,7 +123,8 @@ def glass_of(
     if images.ndim != 3 or not all(side % 2 for side in images.shape[1:]):
         found = " x ".join(map(str, images.shape[::-1]))
         raise InputError(
-            f"a stack of {found} has no middle samples; write images (n, height, width) of odd sides"
+            f"a stack of {found} has no middle samples; write images (n, height, width) of odd"
+            " sides"
         )
     if not 1 <= count <= MAX_IMAGES:
         raise InputError(f"{count} images; write 1 to {MAX_IMAGES}")
@@ -134,7 +135,8 @@ def glass_of(
     for number, image in enumerate(images, start=1):
         if not np.isfinite(image).all() or image.sum() <= 0:
             raise InputError(
-                f"image {number} has samples that are not finite, or no light; write finite ones with a positive sum"
+                f"image {number} has samples that are not finite, or no light; write finite ones"
+                " with a positive sum"
             )
     images = images / images.sum(axis=(1, 2), keepdims=True)
     if per_px < 1:
@@ -262,12 +264,14 @@ def _product(
         f, wavelength, focus = np.argwhere(counts != 1)[0]
         x, y = places_px[f]
         raise InputError(
-            f"the point ({x:g}, {y:g}) px has {counts[f, wavelength, focus]} images of {wavelengths_nm[wavelength]:g} nm at "
-            f"focus {focuses_um[focus]:g} um; give each point one image of each wavelength and focus"
+            f"the point ({x:g}, {y:g}) px has {counts[f, wavelength, focus]} images of"
+            f" {wavelengths_nm[wavelength]:g} nm at focus {focuses_um[focus]:g} um; give each point"
+            " one image of each wavelength and focus"
         )
     if np.isnan(wavelengths_nm).any() and len(wavelengths_nm) > 1:
         raise InputError(
-            "some points have a wavelength and others none; write wavelength_nm for each, or for none"
+            "some points have a wavelength and others none; write wavelength_nm for each, or for"
+            " none"
         )
     return (places_px, wavelengths_nm, focuses_um), place
 
@@ -300,7 +304,8 @@ def _check_numbers(glass: Glass) -> None:
         )
     if not ((glass.illumination >= 0) & (glass.illumination <= 2)).all():
         raise InputError(
-            "relative_illumination is not within 0 to 2; write each point's light relative to the axis"
+            "relative_illumination is not within 0 to 2; write each point's light relative to the"
+            " axis"
         )
     if not ((glass.outside >= 0) & (glass.outside < 1)).all():
         raise InputError(
@@ -326,8 +331,8 @@ def _check_psfs(glass: Glass) -> None:
             raise InputError(f"{where} sums to {total:.4g}; write weights whose PSF sums to 1")
         if abs(off_x) > MAX_OFF * width or abs(off_y) > MAX_OFF * height:
             raise InputError(
-                f"{where} has its centroid {off_x:.1f}, {off_y:.1f} samples from the middle of {width} x {height}; put the "
-                "chief ray there"
+                f"{where} has its centroid {off_x:.1f}, {off_y:.1f} samples from the middle of"
+                f" {width} x {height}; put the chief ray there"
             )
         negative = -np.tensordot(weights, binned, axes=1).clip(max=0).sum()
         if negative > MAX_NEGATIVE:
@@ -418,7 +423,8 @@ def _checked_glass(path: Path, hdus: "fits.HDUList") -> Glass:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:
         raise InputError(
-            f"{path}: its tables cannot be read ({type(error).__name__}); make it with `hilstar optics`"
+            f"{path}: its tables cannot be read ({type(error).__name__}); make it with `hilstar"
+            " optics`"
         ) from error
     return found
 
@@ -428,7 +434,8 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
     per_px, integrated = header.get("OVERSAMP", 1), header.get("PIXINT", False)
     if header.get("PSFVERS") != VERSION:
         raise InputError(
-            f"PSFVERS is {header.get('PSFVERS')!r}, and this hilstar reads {VERSION}; make it with `hilstar optics`"
+            f"PSFVERS is {header.get('PSFVERS')!r}, and this hilstar reads {VERSION}; make it with"
+            " `hilstar optics`"
         )
     if type(per_px) is not int or type(integrated) is not bool:
         raise InputError(
@@ -447,7 +454,8 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
     weights = np.asarray(table["weights"], dtype=np.float64).reshape(len(table), -1)
     if weights.shape[1] != len(basis) or not 1 <= len(table) <= MAX_IMAGES:
         raise InputError(
-            f"{len(table)} points of {weights.shape[1]} weights and {len(basis)} basis images; write one weight for each"
+            f"{len(table)} points of {weights.shape[1]} weights and {len(basis)} basis images;"
+            " write one weight for each"
         )
     axes, place = _product(np.stack([column[name] for name in AXES], axis=1))
     shape = tuple(len(axis) for axis in axes)
@@ -467,7 +475,8 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
             or not ((curve[1] >= 0) & (curve[1] <= 1)).all()
         ):
             raise InputError(
-                f"the table {TRANSMISSION} has wavelengths that do not rise, or values beyond 0 to 1; write those"
+                f"the table {TRANSMISSION} has wavelengths that do not rise, or values beyond 0 to"
+                " 1; write those"
             )
     return Glass(
         *axes,

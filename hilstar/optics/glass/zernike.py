@@ -169,8 +169,9 @@ class PupilField:
         ]
         if max(steps) > MAX_STEP_WAVES:
             raise InputError(
-                f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {max(steps):.2g} waves from one of {PUPIL} "
-                "pupil samples to the next; write smaller coefficients or focus positions"
+                f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {max(steps):.2g}"
+                f" waves from one of {PUPIL} pupil samples to the next; write smaller coefficients"
+                " or focus positions"
             )
         return np.asarray(self._amplitude * np.exp(2j * np.pi / nm * wave_nm))
 
@@ -206,7 +207,8 @@ def psf_of(pupil: Pupil, field: FloatArray, nm: float, per_px: int) -> tuple[Flo
     if step >= 1:
         finest = math.ceil(2 * pupil.pixel_pitch_um / resolution_um)
         raise InputError(
-            f"{per_px} samples a pixel are too few for light of {nm:g} nm; write --oversampling {finest}"
+            f"{per_px} samples a pixel are too few for light of {nm:g} nm; write --oversampling"
+            f" {finest}"
         )
     transform = _poppy().matrixDFT.MatrixFourierTransform(centering="SYMMETRIC")
     image = np.abs(transform.perform(field, side * step, side)) ** 2

@@ -96,7 +96,10 @@ class DiffuseLayer:
             if steps > 1
             else "is not drawn; the virtual tracker has it"
         )
-        return f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's first step; it {drawn}"
+        return (
+            f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's"
+            f" first step; it {drawn}"
+        )
 
     def _lit(
         self, face: "_Face", icrs_to_cam: FloatArray, taken: BoolArray | None

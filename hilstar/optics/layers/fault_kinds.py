@@ -88,7 +88,8 @@ class PlacedFault(Fault, frozen=True, kw_only=True):
         super().check()
         if self.icrs is not None and abs(math.hypot(*self.icrs) - 1) > UNIT_TOLERANCE:
             raise InputError(
-                f"icrs = {list(self.icrs)}: its norm is {math.hypot(*self.icrs):.6g}; write a unit vector x, y, z"
+                f"icrs = {list(self.icrs)}: its norm is {math.hypot(*self.icrs):.6g}; write a unit"
+                " vector x, y, z"
             )
         if any(self.rate_px_s) and self.tracker_px is None and self.screen_px is None:
             given = next(
@@ -166,7 +167,8 @@ class CosmicRays(Fault, frozen=True, kw_only=True):
         if self.number * self.length_px > MAX_TRACK_PX:
             given = f"number = {self.number} and length_px = {self.length_px:g}"
             raise InputError(
-                f"{given} are {self.number * self.length_px:.3g} px of tracks; write at most {MAX_TRACK_PX} px together"
+                f"{given} are {self.number * self.length_px:.3g} px of tracks; write at most"
+                f" {MAX_TRACK_PX} px together"
             )
 
 
@@ -341,7 +343,8 @@ def fault_of(table: Any) -> Fault:
         raise InputError(explained(message, keys, Kind(made, REFERENCE, TYPE_WORDS))) from error
     if not (fault.name.isprintable() and fault.name.strip() == fault.name):
         raise InputError(
-            f"name = {shortened(repr(fault.name))}; write a name of printable letters, without a space at its ends"
+            f"name = {shortened(repr(fault.name))}; write a name of printable letters, without a"
+            " space at its ends"
         )
     fault.check()
     return fault

@@ -107,8 +107,8 @@ class FaultView:
         if by_star and not len(self._places(self.by.stars, fault)):
             said = f'star = "{by_star}"' if isinstance(by_star, str) else f"hip = {by_star}"
             raise InputError(
-                f"{said}: not among the {len(self.by.stars)} stars and bodies of this bench; write one that is, or look at"
-                " [sky] faintest_v_mag"
+                f"{said}: not among the {len(self.by.stars)} stars and bodies of this bench; write"
+                " one that is, or look at [sky] faintest_v_mag"
             )
         if isinstance(fault, PointLight | CosmicRays):
             self.by.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
@@ -121,7 +121,8 @@ class FaultView:
             if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
                 key = "tracker_px" if fault.tracker_px is not None else "screen_px"
                 raise InputError(
-                    f"{key} = {list(place)}: the lens has no direction there; write a place nearer to the image"
+                    f"{key} = {list(place)}: the lens has no direction there; write a place nearer"
+                    " to the image"
                 )
         return fault
 
@@ -154,7 +155,10 @@ class FaultView:
             if isinstance(fault, Gradient):
                 image = gradient_image(fault, camera, by.tracker)
             elif self._folder is None:
-                advice = "a message names no files; write the fault in the scenario, and start it by name"
+                advice = (
+                    "a message names no files; write the fault in the scenario, and start it by"
+                    " name"
+                )
                 raise InputError(f"file = {fault.file!r}: {advice}")
             else:
                 values = read_map(self._folder / fault.file)

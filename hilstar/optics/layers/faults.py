@@ -136,9 +136,11 @@ def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
     if not any(name in gone for name in sprites.discs):
         return sprites
     lights = tuple(
-        replace(light, times=light.times * gone[light.name])
-        if isinstance(light, LightMap | DiscLight) and light.name in gone
-        else light
+        (
+            replace(light, times=light.times * gone[light.name])
+            if isinstance(light, LightMap | DiscLight) and light.name in gone
+            else light
+        )
         for light in sprites.extended
     )
     discs = tuple(name for name in sprites.discs if gone.get(name, 1.0) > 0)

@@ -115,7 +115,8 @@ def read_map(path: Path) -> FloatArray:
     values = _decoded(path, raw)
     if values.ndim != 2 or min(values.shape) < 2 or max(values.shape) > MAX_SIDE_PX:
         raise InputError(
-            f"{path}: an array of shape {values.shape}; {MAP_ADVICE}, 2 to {MAX_SIDE_PX} px on a side"
+            f"{path}: an array of shape {values.shape}; {MAP_ADVICE}, 2 to {MAX_SIDE_PX} px on a"
+            " side"
         )
     if values.dtype.kind not in "fiub":
         raise InputError(f"{path}: values of type {values.dtype}; {MAP_ADVICE}")

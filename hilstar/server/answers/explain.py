@@ -39,7 +39,10 @@ class UnderConvention:
         c = self.convention
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(self.q_icrs_to_cam)
         ra, roll = turn_text(ra_deg), turn_text(roll_deg)
-        said = f"scalar {c.scalar:<5} {c.direction:<11} {c.frame:<4}  RA {ra:>8}  Dec {dec_deg:+8.4f}  roll {roll:>8}"
+        said = (
+            f"scalar {c.scalar:<5} {c.direction:<11} {c.frame:<4}  RA {ra:>8}  Dec {dec_deg:+8.4f} "
+            f" roll {roll:>8}"
+        )
         off = "" if self.off_rad is None else f"  {_angle(self.off_rad)} from what is shown"
         return f"{'>' if self.matches else ' '} {said}{off}"
 
@@ -103,7 +106,8 @@ def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
         at = (-size if settings.checksum_at is None else settings.checksum_at) % len(raw)
         said = decoder.frames.fault(raw) or f"{settings.checksum}, right"
         lines.append(
-            f"  bytes {at:3} to {at + size - 1:3}  {raw[at : at + size].hex(' '):<24} checksum: {said}"
+            f"  bytes {at:3} to {at + size - 1:3}  {raw[at : at + size].hex(' '):<24} checksum:"
+            f" {said}"
         )
     for field in sorted(settings.fields, key=lambda field: field.at):
         _, size, _ = field_format(field.type) or ("u", 1, False)
@@ -149,10 +153,12 @@ def lines_of(
         )
         if form == "frame" and found_as.scalar == "last":
             lines.append(
-                "  and name its four fields qx, qy, qz, qw in the order in which they now are qw, qx, qy, qz"
+                "  and name its four fields qx, qy, qz, qw in the order in which they now are qw,"
+                " qx, qy, qz"
             )
     elif shown is not None and said:
         lines.append(
-            "  no convention matches what is shown: is it another sky, another mounting, or a mirrored frame?"
+            "  no convention matches what is shown: is it another sky, another mounting, or a"
+            " mirrored frame?"
         )
     return lines

@@ -388,7 +388,8 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
     # Numbers of another kind in a frame are the tracker's own affair; four and three of them are
     # fixed by the bench file.
     return JsonAnswer(
-        t_ns, (q[0], q[1], q[2], q[3]), None if rate is None else (rate[0], rate[1], rate[2]), valid,
+        t_ns, (q[0], q[1], q[2], q[3]),
+        None if rate is None else (rate[0], rate[1], rate[2]), valid,
         None if mode is None else f"{mode:g}", None if stars is None else int(stars),
     )  # fmt: skip
 

@@ -164,7 +164,8 @@ class DecodingLink:
             if len(data) > self._bytes_left or self._work_left_s <= 0:
                 refused[FLOOD] += 1
                 details[FLOOD] = (
-                    f"over {MAX_BYTES_PER_S} bytes a second, or noise that takes too long to search: dropped unread"
+                    f"over {MAX_BYTES_PER_S} bytes a second, or noise that takes too long to"
+                    " search: dropped unread"
                 )
                 continue
             self._bytes_left -= len(data)

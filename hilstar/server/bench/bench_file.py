@@ -236,7 +236,8 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     if other:
         meant = did_you_mean(other[0], ["attitude"])
         raise InputError(
-            f"{path}: {shortened(other[0])}: {meant}beside heads stands only [attitude]; write it in the heads' own files"
+            f"{path}: {shortened(other[0])}: {meant}beside heads stands only [attitude]; write it"
+            " in the heads' own files"
         )
     listed = tables.get(HEADS)
     if not isinstance(listed, list) or not all(isinstance(name, str) and name for name in listed):
@@ -258,11 +259,13 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
         if place in places[:k]:
             first = paths[places.index(place)]
             raise InputError(
-                f"{path}: heads: {paths[k].name} is the same file as {first.name}; give each a file of its own"
+                f"{path}: heads: {paths[k].name} is the same file as {first.name}; give each a file"
+                " of its own"
             )
     if files[0].config.attitude.lockstep:
         raise InputError(
-            f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out"
+            f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely;"
+            " take it out"
         )
     return HeadsFile(path, names, files)
 
@@ -276,8 +279,8 @@ def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
     stated = attitude.get("convention")
     if isinstance(stated, dict) and "frame" in stated:
         raise InputError(
-            f'{head}: [attitude] convention = {{ frame = "cam" }}: several heads have one source, the attitude of the body;'
-            ' write frame = "body", or leave it out'
+            f'{head}: [attitude] convention = {{ frame = "cam" }}: several heads have one source,'
+            ' the attitude of the body; write frame = "body", or leave it out'
         )
     convention = msgspec.structs.replace(source.convention, frame="body")
     config = msgspec.structs.replace(

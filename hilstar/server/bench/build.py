@@ -417,7 +417,8 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
         names = ", ".join(tracker.quantum_efficiencies)
         band = f"{V_BAND_NM[0]:g} to {V_BAND_NM[1]:g} nm"
         warn_once(
-            f"[tracker] {names}: no light of V ({band}), in which magnitudes are; all light is from their colours"
+            f"[tracker] {names}: no light of V ({band}), in which magnitudes are; all light is from"
+            " their colours"
         )
     return tuple(
         Optics(
@@ -507,7 +508,10 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     kind = star_kinds(config, catalog)
     if kind is not None:
         unread = int(np.isnan(kind).any(axis=1).sum())
-        note = f"{unread} of {len(catalog)} stars have no MK type of O to M, and their spectra by colour alone"
+        note = (
+            f"{unread} of {len(catalog)} stars have no MK type of O to M, and their spectra by"
+            " colour alone"
+        )
         catalog = dataclasses.replace(catalog, notes=(*catalog.notes, note))
     through = star_flux(config, folder)
     flux, by_bv = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind), None
@@ -669,8 +673,8 @@ def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colour
     primaries, monitor = bench_primaries(config.monitor, folder), config.monitor
     if primaries is None:
         raise InputError(
-            '[tracker.detector] bayer, and [render] colour = "star" with it, need the light of the primaries; write'
-            ' [monitor.primaries] file, or xy_r to xy_b; or colour = "white"'
+            '[tracker.detector] bayer, and [render] colour = "star" with it, need the light of the'
+            ' primaries; write [monitor.primaries] file, or xy_r to xy_b; or colour = "white"'
         )
     places_px = [orientation_of(monitor).in_image(*place) for place in monitor.primaries.places_px]
     channels, rates_by = named_channels(config.tracker, folder), partial(channel_rates, config.sky)
@@ -731,8 +735,9 @@ def brightest_peak_e_per_s(
     peak_e_per_s = float(wanted.max()) * psf.peak_share
     if not MIN_POSITIVE <= peak_e_per_s <= MAX_NUMBER:
         raise InputError(
-            f"[tracker] aperture_mm, quantum_efficiency and transmission: the brightest star to show gives {peak_e_per_s:.3g}"
-            f" electrons per second; write those of a lens that gives it {MIN_POSITIVE:g} to {MAX_NUMBER:g}"
+            "[tracker] aperture_mm, quantum_efficiency and transmission: the brightest star to"
+            f" show gives {peak_e_per_s:.3g} electrons per second; write those of a lens that gives"
+            f" it {MIN_POSITIVE:g} to {MAX_NUMBER:g}"
         )
     return peak_e_per_s
 

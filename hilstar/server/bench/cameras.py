@@ -127,20 +127,23 @@ def display_psfs(
     places_px = onto.places_px(np.stack([x_px, y_px], axis=1))
     if not np.isfinite(places_px).all():
         raise InputError(
-            '[render] psf = "tracker": the tracker looks past the display; check [collimator] q_cam_to_mon'
+            '[render] psf = "tracker": the tracker looks past the display; check [collimator]'
+            " q_cam_to_mon"
         )
     try:
         if isinstance(own, GaussianPsf):
             spread = onto.matrix @ np.diag(np.square(own.sigma_px)) @ onto.matrix.T
             if abs(spread[0, 1]) > OBLIQUE * spread.trace():
                 raise InputError(
-                    "its Gaussian is oval and lies obliquely on the display; give [tracker.optics] psf a file"
+                    "its Gaussian is oval and lies obliquely on the display; give [tracker.optics]"
+                    " psf a file"
                 )
             yield GaussianPsf((math.sqrt(spread[0, 0]), math.sqrt(spread[1, 1]))), None
             return
         if isinstance(own, SampledPsf) and own.pixel_integrated:
             raise InputError(
-                "it has the tracker's pixel in it (PIXINT), which the detector adds again; give one without"
+                "it has the tracker's pixel in it (PIXINT), which the detector adds again; give one"
+                " without"
             )
         glass = glass_in(tracker, folder)
         if glass is not None:
@@ -228,7 +231,8 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     optics = tracker.optics
     if optics.focus_um_per_k and optics.psf == GAUSSIAN:
         raise InputError(
-            "[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave it out"
+            "[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave"
+            " it out"
         )
     camera = monitor_camera(
         tracker.resolution_px,
@@ -299,7 +303,10 @@ class FieldsOfView:
         )
         across = tracker[0] if tracker[0] == tracker[1] else " x ".join(tracker)
         pixel = figure(self.tracker_px_a_monitor_px)
-        return f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a monitor px"
+        return (
+            f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a"
+            " monitor px"
+        )
 
     def keys(self) -> dict[str, Any]:
         """The fields of view as --json has them."""
@@ -379,7 +386,10 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
     """Lengths that cannot be right, the plainest first."""
     tracker, monitor, verify = config.tracker, config.monitor, config.verify
     pixels, widest_deg = found.tracker_px_a_monitor_px, max(*found.screen_deg, *found.tracker_deg)
-    past = f"the tracker sees past the screen: {_percent(found.field_on_screen)} of its field is on it ({found.line()})"
+    past = (
+        f"the tracker sees past the screen: {_percent(found.field_on_screen)} of its field is on it"
+        f" ({found.line()})"
+    )
     part = f"the tracker sees {_percent(found.screen_seen)} of the screen ({found.line()})"
     judged = [
         (past, found.field_on_screen, (MIN_FILLED, 1.0)),
@@ -397,7 +407,10 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
         ("[monitor] pixel_pitch_um", monitor.pixel_pitch_um, MONITOR_PITCHES_UM, ""),
         ("[collimator] focal_length_mm", config.collimator.focal_length_mm, COLLIMATORS_MM, ""),
     ):
-        text = f"{name} is {unit}{figure(value)}, and none is known outside {unit}{low:g} to {unit}{high:g}"
+        text = (
+            f"{name} is {unit}{figure(value)}, and none is known outside {unit}{low:g} to"
+            f" {unit}{high:g}"
+        )
         judged.append((text, value, (low, high)))
     text = f"{figure(widest_deg)} deg is wider than a lens sees ({found.line()})"
     judged.append(
@@ -447,7 +460,10 @@ def _readings(config: BenchConfig) -> Iterator[tuple[str, BenchConfig]]:
     tracker = config.tracker
     if F_NUMBERS[0] <= tracker.aperture_mm < F_NUMBERS[1]:
         aperture_mm = tracker.focal_length_mm / tracker.aperture_mm
-        text = f"[tracker] aperture_mm = {tracker.aperture_mm:.6g} the f-number, which is {aperture_mm:.6g}"
+        text = (
+            f"[tracker] aperture_mm = {tracker.aperture_mm:.6g} the f-number, which is"
+            f" {aperture_mm:.6g}"
+        )
         yield text, replace(config, tracker=replace(tracker, aperture_mm=aperture_mm))
     for table, key in LENGTHS:
         settings = getattr(config, table)

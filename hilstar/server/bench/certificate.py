@@ -172,7 +172,10 @@ def off_by(found: Certificate) -> str:
     if found.attitude_arcsec is None:
         return "its own attitude was not assessed"
     cross, roll = found.attitude_arcsec
-    return f"the bench itself is off by at most {cross:.3g} arcsec across and {roll:.3g} about the boresight (95 %)"
+    return (
+        f"the bench itself is off by at most {cross:.3g} arcsec across and {roll:.3g} about the"
+        " boresight (95 %)"
+    )
 
 
 def certificate_number(file: BenchFile) -> str:

@@ -299,8 +299,9 @@ class Colours:
             truth["electrons_per_s"][own],
         )
         added = {
-            "temperature_shown_k": truth["temperature_k"][own]
-            * self.temperature_factor(wanted, shares)
+            "temperature_shown_k": (
+                truth["temperature_k"][own] * self.temperature_factor(wanted, shares)
+            )
         }
         if self.mono:
             added |= {"wavelength_nm": wanted[:, 0], "wavelength_shown_nm": shown[:, 0]}
@@ -364,7 +365,8 @@ def mixed_for(
     unseen = [name for name, share in zip(PRIMARIES, of_white, strict=True) if share < UNSEEN]
     if unseen:
         raise InputError(
-            f'[render] colour = "star": the tracker sees nothing of the primary {", ".join(unseen)}; write colour = "white"'
+            '[render] colour = "star": the tracker sees nothing of the primary'
+            f' {", ".join(unseen)}; write colour = "white"'
         )
     optics = all_channels(list(channels.values()))
     nm = np.arange(optics.range_nm[0], optics.range_nm[1] + STEP_NM, STEP_NM)

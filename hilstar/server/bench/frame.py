@@ -524,7 +524,8 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
     norm = math.hypot(*array)  # without NumPy's warning where it overflows
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         raise InputError(
-            f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
+            f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x,"
+            " y, z"
         )
     return normalise(array)
 
@@ -566,7 +567,10 @@ def clipping_line(bench: Bench) -> str | None:
         if render.brightest_v_mag is None
         else f"brightest_v_mag = {render.brightest_v_mag:g}"
     )
-    return f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render] {key})"
+    return (
+        f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render]"
+        f" {key})"
+    )
 
 
 def drawn_line(bench: Bench) -> str | None:
@@ -589,8 +593,9 @@ def shares_line(bench: Bench) -> str | None:
         return None
     shares = ", ".join(f"{share:g}" for share in calibration.weights)
     return (
-        f'[render] bit_stealing with calibration = "{calibration.name}" assumes that the tracker sees white as {shares} of red,'
-        " green and blue, as a photometer does; measure it (hilstar first-light), or write a calibration file with [weights]"
+        f'[render] bit_stealing with calibration = "{calibration.name}" assumes that the tracker'
+        f" sees white as {shares} of red, green and blue, as a photometer does; measure it (hilstar"
+        " first-light), or write a calibration file with [weights]"
     )
 
 
@@ -601,6 +606,6 @@ def colour_line(bench: Bench) -> str | None:
     if bench.colours is None or bench.config.monitor.primaries.xy_r is None:
         return None
     return (
-        "[monitor.primaries] xy_r, xy_g and xy_b: the primaries' spectra are Gaussians of about those chromaticities, so all"
-        " colours are approximate; measure the spectra, and write file"
+        "[monitor.primaries] xy_r, xy_g and xy_b: the primaries' spectra are Gaussians of about"
+        " those chromaticities, so all colours are approximate; measure the spectra, and write file"
     )

@@ -122,12 +122,14 @@ def _glass_psf(
     beyond_px = float(found.field.within(*corners.T)[1].max())
     if len(glass.places_px) > 1 and beyond_px > SAID_PX:
         say_once(
-            f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest PSF is taken"
+            f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest"
+            " PSF is taken"
         )
     first, last = glass.focuses_um[[0, -1]]
     if not first <= focus_um <= last:
         say_once(
-            f"focus_um = {focus_um:g} is beyond the file's {first:g} to {last:g}; the nearest is taken"
+            f"focus_um = {focus_um:g} is beyond the file's {first:g} to {last:g}; the nearest is"
+            " taken"
         )
     return found
 
@@ -155,7 +157,8 @@ def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
         if share > MAX_UNSAID * weight.sum():
             limit = first if side == "under" else last
             say_once(
-                f"{share / weight.sum():.0%} of the light is {side} the file's {limit:g} nm, whose PSF it is given"
+                f"{share / weight.sum():.0%} of the light is {side} the file's {limit:g} nm, whose"
+                " PSF it is given"
             )
     return np.asarray(shares)
 
@@ -198,6 +201,7 @@ def through_glass(camera: Camera, tracker: Tracker, folder: Path) -> Camera:
     off_px = float(np.nanmax(np.hypot(*off)))
     if off_px > SAID_PX:
         say_once(
-            f"its distortion is up to {off_px:.1f} px from that of [tracker] distortion, which is taken"
+            f"its distortion is up to {off_px:.1f} px from that of [tracker] distortion, which is"
+            " taken"
         )
     return camera

@@ -109,11 +109,13 @@ def check_monitor(
                 doubts.append("the monitor's own settings cannot be read now (DDC/CI)")
             if found := ", ".join(differences(one.identity, now)):
                 faults.append(
-                    f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}: {found}"
+                    f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}:"
+                    f" {found}"
                 )
         if one.date is not None and (age := (today - one.date).days) > days:
             faults.append(
-                f"{one.name} was measured {age} days ago, on {one.date}: [monitor] calibration_valid_days = {days:g}"
+                f"{one.name} was measured {age} days ago, on {one.date}: [monitor]"
+                f" calibration_valid_days = {days:g}"
             )
     if now is None:
         unknown = ["this display does not say which monitor it is"]

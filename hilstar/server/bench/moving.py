@@ -117,7 +117,8 @@ def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
         # Vallado et al. 2006: SGP4 is 1 to 3 km off a day in a low orbit, the Moon 0.5 to 1.6
         # arcsec a day.
         log.warning(
-            "%s: its elements are %.0f days from [sky] epoch_utc; a low orbit is then off by %.0f km or more",
+            "%s: its elements are %.0f days from [sky] epoch_utc; a low orbit is then off by %.0f"
+            " km or more",
             path,
             abs(age_days),
             abs(age_days),
@@ -131,7 +132,8 @@ def observer_lines(config: BenchConfig) -> list[str]:
         return []
     where = "the sky is seen from the Earth's centre, without the Earth"
     return [
-        f'[spacecraft] orbit = "{SOURCE}": until a message has said where the spacecraft is, {where}'
+        f'[spacecraft] orbit = "{SOURCE}": until a message has said where the spacecraft is,'
+        f" {where}"
     ]
 
 
@@ -157,5 +159,6 @@ def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
         return []
     placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)
     return [
-        f"satellites: {placed} of {every} have a place by their elements; {known} are in [sky.bodies] satellite_magnitudes"
+        f"satellites: {placed} of {every} have a place by their elements; {known} are in"
+        " [sky.bodies] satellite_magnitudes"
     ]

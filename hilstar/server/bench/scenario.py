@@ -116,13 +116,15 @@ def parse_scenario(path: Path, text: str) -> Scenario:
             raise InputError(f"{path}: {_place(number, table)} {error}") from error
         if any(other.name == fault.name for other in faults):
             raise InputError(
-                f'{path}: {_place(number, table)} another fault has name = "{fault.name}"; write a name of its own'
+                f'{path}: {_place(number, table)} another fault has name = "{fault.name}"; write a'
+                " name of its own"
             )
         faults.append(fault)
     wide = sum(isinstance(fault, Gradient | MeasuredMap) for fault in faults)
     if wide > MAX_SURFACES:
         raise InputError(
-            f"{path}: has {wide} gradients and maps, each an image of its own; write at most {MAX_SURFACES}"
+            f"{path}: has {wide} gradients and maps, each an image of its own; write at most"
+            f" {MAX_SURFACES}"
         )
     if not faults:
         raise InputError(

@@ -65,7 +65,8 @@ def site_extinction(site: SiteSettings, folder: Path) -> Curve:
     if isinstance(site.extinction, int | float):
         if not 0 <= site.extinction <= MAX_EXTINCTION:
             raise InputError(
-                f"[site] extinction = {site.extinction:g}: write magnitudes an air mass, 0 to {MAX_EXTINCTION:g}"
+                f"[site] extinction = {site.extinction:g}: write magnitudes an air mass, 0 to"
+                f" {MAX_EXTINCTION:g}"
             )
         return constant_curve(float(site.extinction))
     found = extinction_curve(site.extinction)
@@ -74,8 +75,8 @@ def site_extinction(site: SiteSettings, folder: Path) -> Curve:
         if not exists(path):
             near = did_you_mean(site.extinction, names)
             raise InputError(
-                f"[site] extinction = {site.extinction!r}: no such place or file {path}; {near}write one of {', '.join(names)},"
-                " a CSV path or a number"
+                f"[site] extinction = {site.extinction!r}: no such place or file {path};"
+                f" {near}write one of {', '.join(names)}, a CSV path or a number"
             )
         found = read_curve_csv(path, MAX_EXTINCTION)
     return found

@@ -102,7 +102,10 @@ class StarRemedy:
 
     def lines(self) -> Iterator[str]:
         """The table of panels, for a person."""
-        yield f"{'panel':24}{'pitch':>8}  collimator, its star within the limit and the field on the screen"
+        yield (
+            f"{'panel':24}{'pitch':>8}  collimator, its star within the limit and the field on the"
+            " screen"
+        )
         for one in self.panels:
             lengths = f"none: the star is {one.sigma_ratio:.1f} times as wide where the field fits"
             if one.collimator_mm is not None:

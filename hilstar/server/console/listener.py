@@ -89,12 +89,14 @@ class PageListener(Closing):
     ) -> None:
         if token is not None and TOKEN.fullmatch(token) is None:
             raise InputError(
-                "--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32` makes them"
+                "--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32`"
+                " makes them"
             )
         for name in names:
             if NAME.fullmatch(name) is None:
                 raise InputError(
-                    f"--console-name {shortened(name)}: write a name as browsers have it, such as stars.lab:8443"
+                    f"--console-name {shortened(name)}: write a name as browsers have it, such as"
+                    " stars.lab:8443"
                 )
         self.names = names
         self.made = token is None and not address.is_loopback

@@ -410,13 +410,15 @@ def setup_for(
         token="" if page is None else page.token,
         picture_bytes=picture_bytes,
         pace=description.pace,
-        scpi=None
-        if scpi is None
-        else messages.ScpiSetup(
-            scpi.token,
-            description.kind,
-            description.steer_port,
-            file.config.attitude.max_rate_deg_s,
+        scpi=(
+            None
+            if scpi is None
+            else messages.ScpiSetup(
+                scpi.token,
+                description.kind,
+                description.steer_port,
+                file.config.attitude.max_rate_deg_s,
+            )
         ),
     )
 

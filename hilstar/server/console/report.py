@@ -94,8 +94,8 @@ def report_page(data: dict[str, Any]) -> str:
     style = palette_css() + (PAGE_DIR / "page.css").read_text(encoding="utf-8")
     script = one_script("report")
     policy = (
-        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src data:; base-uri 'none'; "
-        "form-action 'none'"
+        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src data:;"
+        " base-uri 'none'; form-action 'none'"
     )
     icon = base64.b64encode((PAGE_DIR / "icon.svg").read_bytes()).decode()
     head = (
@@ -103,7 +103,10 @@ def report_page(data: dict[str, Any]) -> str:
         f'<link rel="icon" href="data:image/svg+xml;base64,{icon}">\n<style>{style}</style>\n'
     )
     packed = base64.b64encode(zlib.compress(msgspec.json.encode(data), 9)).decode()
-    tail = f'<script type="text/plain" id="run-data">{packed}</script>\n<script type="module">{script}</script>\n'
+    tail = (
+        f'<script type="text/plain" id="run-data">{packed}</script>\n<script'
+        f' type="module">{script}</script>\n'
+    )
     html = LINKS.sub("", html).replace('data-mode="live"', 'data-mode="report"')
     # The data come before the script that reads them, and both after the page's own text.
     return html.replace("</head>", f"{head}</head>").replace("</body>", f"{tail}</body>")
@@ -112,8 +115,8 @@ def report_page(data: dict[str, Any]) -> str:
 MAX_BYTES = 3_000_000  # all pictures together, packed
 NO_BENCH = "the ledger's head has no bench file"
 CAUTION = (
-    "Drawn by a bench that is not the run's own: a file that it names has changed since, or another version of hilstar wrote "
-    "the ledger. Codes may differ from those shown."
+    "Drawn by a bench that is not the run's own: a file that it names has changed since, or another"
+    " version of hilstar wrote the ledger. Codes may differ from those shown."
 )
 
 
@@ -454,9 +457,12 @@ def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[st
     down = 2 * (x * y + w * z), (1 - 2 * (x * x + z * z))
     east = tuple(-np.sin(ra) * axis[0] + np.cos(ra) * axis[1] for axis in (right, down))
     ra_deg, roll_deg = (np.degrees(np.unwrap(part)) for part in (ra, np.arctan2(east[1], -east[0])))
-    return np.column_stack(
-        ((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)
-    ), NAMES
+    return (
+        np.column_stack(
+            ((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)
+        ),
+        NAMES,
+    )
 
 
 def report(path: Path, directory: Path) -> RunReport:

@@ -91,7 +91,10 @@ class RunStatus:
         if shown is None or running is None:
             return "no frame yet"
         attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
-        told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
+        told = (
+            f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets,"
+            f" {packets.refused} refused"
+        )
         wrong = "".join(f"{one.text}; " for one in running.loop.notices.wrong_sky.now())
         return f"{wrong}attitude {attitude.text}; {told}" + (
             "; shown by --force" if self._source.forced else ""
@@ -107,7 +110,10 @@ class RunStatus:
         self._before = (now_ns, tally.frames, packets.received)
         seconds = max(now_ns - then_ns, 1) / NS_PER_S
         total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
-        text = f"{tally.frames}{total} ({(tally.frames - frames) / seconds:.1f}/s), {tally.missed_frames} missed"
+        text = (
+            f"{tally.frames}{total} ({(tally.frames - frames) / seconds:.1f}/s),"
+            f" {tally.missed_frames} missed"
+        )
         frames_line = StatusLine(
             "frames", f"{text}, {tally.stale_frames} stale", not tally.missed_frames
         )
@@ -119,7 +125,10 @@ class RunStatus:
         refused = ", ".join(
             f"{reason} {count}" for reason, count in packets.refused_by.items() if count
         )
-        told = f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s), {packets.refused} refused"
+        told = (
+            f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s),"
+            f" {packets.refused} refused"
+        )
         refused = ", ".join(
             [refused] * bool(refused) + [f"{packets.lost} lost"] * bool(packets.lost)
         )
@@ -171,7 +180,10 @@ def _tracker_line(found: "TrackerFigures") -> StatusLine:
 
     late = "-" if found.latency_ms is None else f"{found.latency_ms:.0f} ms"
     share = "-" if found.availability is None else f"{100 * found.availability:.1f} %"
-    text = f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share} available, {late} late"
+    text = (
+        f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share}"
+        f" available, {late} late"
+    )
     text += f", {found.mode}" if found.mode else ""
     text += (
         f"; {found.wrong} of {found.answers} answers wrong"

@@ -114,7 +114,8 @@ HEADER = re.compile(
     r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)"
 )
 NUMBER = re.compile(
-    r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?[ \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?"
+    r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?["
+    r" \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?"
 )
 INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 INSTEAD: "dict[Reason, str]" = {
     "format": "send packets of 64 bytes, version 1, little-endian, or JSON with t_ns and q",
-    "crc": "end each packet with the CRC-32 of zlib over the 60 bytes before it, and look at the cable",
+    "crc": (
+        "end each packet with the CRC-32 of zlib over the 60 bytes before it, and look at the cable"
+    ),
     "nan": "send finite numbers",
     "norm": "send unit quaternions, scalar first, not angles",
     "rate": "send rates in rad/s, or write a larger [attitude] max_rate_deg_s",
@@ -86,13 +88,19 @@ def report(summary: "RunSummary", as_json: bool) -> None:
     )
     lost = f", {packets.lost} lost" if packets.lost else ""
     lines = {
-        "frames": f"{summary.frames} in {summary.duration_s:.2f} s ({figure(summary.fps, 1)} fps)"
-        f", {summary.missed_frames} missed, {summary.stale_frames} stale",
-        "frame time": f"{spread(summary.frame_ms)} ms (p50 / p99 / max), attitude in to codes ready",
+        "frames": (
+            f"{summary.frames} in {summary.duration_s:.2f} s ({figure(summary.fps, 1)} fps)"
+            f", {summary.missed_frames} missed, {summary.stale_frames} stale"
+        ),
+        "frame time": (
+            f"{spread(summary.frame_ms)} ms (p50 / p99 / max), attitude in to codes ready"
+        ),
         "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
-        "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
-        + "".join(
-            f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]
+        "stars drawn": (
+            f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
+            + "".join(
+                f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]
+            )
         ),
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
     }
@@ -151,7 +159,10 @@ def clock_line(clock: "ClockSummary") -> str:
     if clock.mode == "shared":
         return "shared with the sender"
     if clock.mode == "unix":
-        return f"Unix time, kept to {clock.uncertainty_ms or 0.0:.3f} ms by this machine's kernel, and the sender's own error"
+        return (
+            f"Unix time, kept to {clock.uncertainty_ms or 0.0:.3f} ms by this machine's kernel, and"
+            " the sender's own error"
+        )
     if clock.uncertainty_ms is None:
         return f"{CLOCK_WORDS[clock.mode]}: heard too briefly to state an uncertainty"
     known = f"drift {clock.drift_ppm:.1f} ppm, uncertainty {clock.uncertainty_ms:.3f} ms"

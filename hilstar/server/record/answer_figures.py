@@ -193,9 +193,9 @@ class _Fault:
             before=before,
             during=during,
             after=after,
-            first_wrong_s=None
-            if self.first_wrong_ns is None
-            else _s(self.first_wrong_ns, self.start_ns),
+            first_wrong_s=(
+                None if self.first_wrong_ns is None else _s(self.first_wrong_ns, self.start_ns)
+            ),
             recovered_s=0.0 if self.was_right and recovered_s is not None else recovered_s,
         )
 
@@ -314,7 +314,10 @@ def answer_rows(found: AnswerReport | None) -> list[tuple[str, str]]:
     """The figures as rows of text: name and value."""
     if found is None:
         return []
-    refused = f"{found.right} right, {found.wrong} wrong, {found.invalid} without an attitude, {found.unpaired} of no sky"
+    refused = (
+        f"{found.right} right, {found.wrong} wrong, {found.invalid} without an attitude,"
+        f" {found.unpaired} of no sky"
+    )
     if found.unjudged:
         refused += f", {found.unjudged} not judged"
     if found.out_of_order:

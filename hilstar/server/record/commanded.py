@@ -205,7 +205,8 @@ def read_commanded(ledger: Path) -> CommandedRun:
     light_ns, last = np.unique(np.array(light, dtype=np.int64)[::-1], return_index=True)
     if len(light_ns) < 2:
         raise InputError(
-            f"{ledger}: {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}"
+            f"{ledger}:"
+            f" {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}"
         )
     q = np.array(shown).reshape(-1, 4)[::-1][last]
     t_s = (light_ns - light_ns[0]) / NS_PER_S

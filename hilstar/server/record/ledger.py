@@ -18,11 +18,11 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import msgspec
 
@@ -140,7 +140,11 @@ class FloodFilter:
 
     # Refused packets tell little after the first ones; no sender means to send more than 2000 good
     # ones a second.
-    ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
+    ALLOWED: ClassVar[Mapping[str, tuple[int, int]]] = {
+        "accepted": (4000, 2000),
+        "refused": (20, 1),
+        "event": (100, 10),
+    }
 
     def __init__(self) -> None:
         self._allowances: dict[tuple[Kind, str], Allowance] = {}
@@ -333,7 +337,8 @@ class Ledger(Closing):
         if time.monotonic() - self._alive_s > STALLED_S:
             self._notices.begin(
                 "ledger-stalled",
-                f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on",
+                f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display"
+                " goes on",
             )
 
     def notice(self, notice: Notice) -> None:

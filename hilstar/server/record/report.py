@@ -587,9 +587,9 @@ def summarise(run: RunFigures) -> RunReport:
         timestamp_source="" if last is None else last.timestamp_source,
         refresh_hz=refresh_hz,
         pacing_jitter_ms=run.spreads["interval"].deviation,
-        attitude_age_frames=None
-        if refresh_hz is None
-        else times["attitude_age_ms"].times(refresh_hz / 1e3),
+        attitude_age_frames=(
+            None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3)
+        ),
         packets=run.packets.counts,
         lost_packets=run.lost,
         wrong_sky=run.wrong_sky.total(
@@ -627,11 +627,17 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("coarser paths", f"{found.capped_frames} frames, because the turn was too fast"),
         (
             "time stamps",
-            f"{found.timestamp_source}; the bench file's refresh rate is {number(found.refresh_hz, 'Hz')}",
+            (
+                f"{found.timestamp_source}; the bench file's refresh rate is"
+                f" {number(found.refresh_hz, 'Hz')}"
+            ),
         ),
         (
             "pacing jitter",
-            f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval between swaps)",
+            (
+                f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval"
+                " between swaps)"
+            ),
         ),
         ("interval", three(found.interval_ms)),
         ("swap later than predicted", three(found.swap_late_ms)),
@@ -645,13 +651,19 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         *[(one.kind, f"{one.seconds:.1f} s: {one.text}") for one in found.wrong_sky.conditions],
         (
             "packets",
-            f"{found.packets.get('accepted', 0)} accepted, {refused} refused, {found.lost_packets} lost",
+            (
+                f"{found.packets.get('accepted', 0)} accepted, {refused} refused,"
+                f" {found.lost_packets} lost"
+            ),
         ),
         ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
         ("pulses", pulses),
         (
             "stars",
-            f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint",
+            (
+                f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step}"
+                " too faint"
+            ),
         ),
         *answer_rows(found.answers or None),
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
@@ -660,6 +672,9 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         *([("certificate", found.certificate)] if found.certificate else []),
         (
             "renderer",
-            f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by {found.render_path or '-'}",
+            (
+                f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by"
+                f" {found.render_path or '-'}"
+            ),
         ),
     ]

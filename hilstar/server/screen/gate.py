@@ -142,7 +142,8 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     if not timing.paced_by_screen:
         ms = timing.period_ms
         log.warning(
-            "the display has no refresh of its own (swaps take %.2f ms): frames are paced by software",
+            "the display has no refresh of its own (swaps take %.2f ms): frames are paced by"
+            " software",
             ms,
         )
     if window.gone is not None:
@@ -169,10 +170,14 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
     )
     doubts = [finding.text for finding in told if not finding.refused]
     if window.others:
-        others = f"the X screen has other displays, {', '.join(window.others)}: frames may be copied instead of flipped, or"
+        others = (
+            f"the X screen has other displays, {', '.join(window.others)}: frames may be copied"
+            " instead of flipped, or"
+        )
         doubts.insert(
             0,
-            f"{others} follow another's refresh; switch them off, or give this one an X screen of its own",
+            f"{others} follow another's refresh; switch them off, or give this one an X screen of"
+            " its own",
         )
     for doubt in doubts:
         log.warning("%s", doubt)
@@ -296,11 +301,20 @@ def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
 
 def _desktop_faults(window: Window) -> Iterator[str]:
     if window.by_wayland:
-        yield "a Wayland compositor draws this display (XWayland), and holds frames back; use an Xorg session"
+        yield (
+            "a Wayland compositor draws this display (XWayland), and holds frames back; use an Xorg"
+            " session"
+        )
     if window.ramp_refused:
-        yield "the display keeps a gamma ramp that is not straight; stop what sets it (night light, colour management)"
+        yield (
+            "the display keeps a gamma ramp that is not straight; stop what sets it (night light,"
+            " colour management)"
+        )
     if window.composited:
-        yield "a compositing manager draws this display and may hold frames back; stop it, or use a plain X session"
+        yield (
+            "a compositing manager draws this display and may hold frames back; stop it, or use a"
+            " plain X session"
+        )
     if window.mirrored is not None:
         advice = "switch it off, or give this one an X screen of its own (docs/bench-pc.md)"
         yield f"the display {window.mirrored} mirrors this one; {advice}"
@@ -315,11 +329,20 @@ def _depth_faults(window: Window, monitor: Monitor) -> Iterator[str]:
         yield f"the window has {depths}; set [monitor] bits, or the depth of the X screen"
     elif window.screen_bits != buffer.bits:
         depths = f"{window.screen_bits} bits per colour and the window {buffer.bits}"
-        yield f"the X screen has {depths}, so that X converts codes; set [monitor] bits, or DefaultDepth of the X screen"
+        yield (
+            f"the X screen has {depths}, so that X converts codes; set [monitor] bits, or"
+            " DefaultDepth of the X screen"
+        )
     if buffer.samples > 1:
-        yield f"the driver draws {buffer.samples} samples a pixel; switch forced antialiasing off in its settings"
+        yield (
+            f"the driver draws {buffer.samples} samples a pixel; switch forced antialiasing off in"
+            " its settings"
+        )
     if wanted > PLAIN_BITS and 0 < window.ramp_size < 2**wanted:
-        yield f"the display's gamma ramp has {window.ramp_size} steps, too few for {wanted} bits; set [monitor] bits = 8"
+        yield (
+            f"the display's gamma ramp has {window.ramp_size} steps, too few for {wanted} bits; set"
+            " [monitor] bits = 8"
+        )
 
 
 def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
@@ -327,10 +350,19 @@ def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
         hz = f"{1000.0 / timing.period_ms:.2f} Hz and the bench file says {monitor.refresh_hz:g}"
         yield f"the display refreshes at {hz}; set [monitor] refresh_hz, or the display's mode"
     if timing.dropped > MAX_DROPPED:
-        yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs that draw on it"
+        yield (
+            f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs"
+            " that draw on it"
+        )
     if timing.variable:
-        ways = 'Option "VariableRefresh" "false", adaptive_sync=false (Mesa), __GL_VRR_ALLOWED=0 (NVIDIA), or the monitor\'s menu'
-        yield f"the display has a variable refresh: it shows a frame when it comes; switch that off ({ways})"
+        ways = (
+            'Option "VariableRefresh" "false", adaptive_sync=false (Mesa), __GL_VRR_ALLOWED=0'
+            " (NVIDIA), or the monitor's menu"
+        )
+        yield (
+            "the display has a variable refresh: it shows a frame when it comes; switch that off"
+            f" ({ways})"
+        )
     if timing.queued:
         held = f"{timing.queued} finished frame{'s' * (timing.queued > 1)}"
         late = f"light comes {timing.queued * timing.period_ms:.1f} ms after the swap"

@@ -246,7 +246,10 @@ class Screen:
         return swap_ns
 
 
-CHANGED = "another program changed the display's gamma ramp: codes make other light; stop it (night light, colord, redshift)"
+CHANGED = (
+    "another program changed the display's gamma ramp: codes make other light; stop it (night"
+    " light, colord, redshift)"
+)
 
 
 class DisplayPacer(Pacer):

@@ -456,9 +456,11 @@ class MovingSky:
         from_sun_km = sight.seen_km + sight.view.from_sun_km
         v_mag = np.array(
             [
-                DARK_V_MAG
-                if name == EARTH
-                else body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
+                (
+                    DARK_V_MAG
+                    if name == EARTH
+                    else body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
+                )
                 for row, name in zip(self._drawn, self.names, strict=True)
             ]
         )
@@ -489,7 +491,8 @@ class MovingSky:
                 for jd in (first, last)
             ]
             raise InputError(
-                f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date between them"
+                f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date"
+                " between them"
             )
         return limits[0], limits[1]
 
@@ -501,8 +504,9 @@ class MovingSky:
         if abs(since_ns) > YEAR_NS and not self._told:
             self._told = True
             log.warning(
-                "t_ns = %d is %.1f years from the date of the stars, whose proper motion and parallax stay: [sky] epoch_utc is"
-                ' the UTC of t_ns = 0, or "unix" where t_ns counts from 1970',
+                "t_ns = %d is %.1f years from the date of the stars, whose proper motion and"
+                ' parallax stay: [sky] epoch_utc is the UTC of t_ns = 0, or "unix" where t_ns'
+                " counts from 1970",
                 t_ns,
                 since_ns / YEAR_NS,
             )

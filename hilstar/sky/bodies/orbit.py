@@ -130,13 +130,15 @@ def _checked(name: str, text: str) -> tuple[str, str]:
     ]
     if [line[0] for line in found] != ["1", "2"]:
         raise InputError(
-            f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2; {TLE_ADVICE}"
+            f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2;"
+            f" {TLE_ADVICE}"
         )
     for number, line in enumerate(found, start=1):
         total = sum(int(c) if c.isdigit() else c == "-" for c in line[:-1]) % 10
         if str(total) != line[-1]:
             raise InputError(
-                f"{name}: element line {number}: its digits add up to {total}, not {line[-1]}; {TLE_ADVICE}"
+                f"{name}: element line {number}: its digits add up to {total}, not {line[-1]};"
+                f" {TLE_ADVICE}"
             )
     return found[0], found[1]
 
@@ -276,7 +278,8 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
             words = line.split()
             if len(words) not in COUNTS:
                 raise InputError(
-                    f"{name}:{number}: {line[:40]!r}; write an epoch, X Y Z (km) and X_DOT Y_DOT Z_DOT (km/s)"
+                    f"{name}:{number}: {line[:40]!r}; write an epoch, X Y Z (km) and X_DOT Y_DOT"
+                    " Z_DOT (km/s)"
                 )
             rows.append([str(number), *words[:7]])
     if section == "metadata":
@@ -305,7 +308,8 @@ def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator
     back = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(back):
         raise InputError(
-            f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the lines by time"
+            f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the"
+            " lines by time"
         )
     yield Segment(scale, t_ns, states)
 
@@ -345,7 +349,8 @@ def _epoch_ns(text: str, where: str) -> int:
         return seconds * NS_PER_S + round(float(second) * NS_PER_S)
     except ValueError:
         raise InputError(
-            f"{where}: the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f"
+            f"{where}: the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or"
+            " YYYY-DDDThh:mm:ss.f"
         ) from None
 
 

@@ -328,8 +328,8 @@ class Satellites:
         if old:
             self._age_told = True
             log.warning(
-                "%s: the elements of %d of %d satellites are more than %.0f days from the sky's date (%.0f at most); a low"
-                " orbit is off by 1 to 3 km a day",
+                "%s: the elements of %d of %d satellites are more than %.0f days from the sky's"
+                " date (%.0f at most); a low orbit is off by 1 to 3 km a day",
                 self.file,
                 old,
                 len(ages),
@@ -347,7 +347,8 @@ class Satellites:
         first = int(lost[0])
         reason = SGP4_ERRORS.get(int(self._swarm.error[first]), "no number")
         log.warning(
-            "%d of %d satellites have no place by their elements at this time and are left out, such as %s: %s",
+            "%d of %d satellites have no place by their elements at this time and are left out,"
+            " such as %s: %s",
             len(lost),
             len(self),
             self.names[first],

@@ -82,7 +82,10 @@ COLUMNS = {
     "flash_at_s": (-1e10, 1e10),
     "size_m": (0.0, 1e5),
 }
-TABLE_FORM = f"write a CSV with the columns {KEY},{','.join(COLUMNS)}, of which only the first has to be there"
+TABLE_FORM = (
+    f"write a CSV with the columns {KEY},{','.join(COLUMNS)}, of which only the first has to be"
+    " there"
+)
 Row = dict[str, float]
 STEP_S = 20
 STEP_NS = STEP_S * NS_PER_S
@@ -134,9 +137,11 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
         raise InputError(f"{file}: no element set in it; {LIST_FORM}")
     shared = Counter(one.name for one in found.values())
     names = (
-        (one.name if shared[one.name] == 1 else f"{one.name} {one.number}")
-        if one.name
-        else f"NORAD {one.number}"
+        (
+            (one.name if shared[one.name] == 1 else f"{one.name} {one.number}")
+            if one.name
+            else f"NORAD {one.number}"
+        )
         for one in found.values()
     )
     return [
@@ -177,7 +182,8 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
             if line[2:7] != first[2:7]:
                 other = first[2:7].strip()
                 raise InputError(
-                    f"{where}: it is of satellite {line[2:7].strip()}, line {first_at} of {other}; {LIST_FORM}"
+                    f"{where}: it is of satellite {line[2:7].strip()}, line {first_at} of {other};"
+                    f" {LIST_FORM}"
                 )
             yield name, first, line
             name, first = "", ""
@@ -211,7 +217,8 @@ def _check(line: str, where: str) -> None:
     total = sum(map(DIGIT_SUM.__getitem__, line[:-1].encode())) % 10
     if str(total) != line[-1]:
         raise InputError(
-            f"{where}: its digits add up to {total}, not {line[-1]}: a damaged line; take the list anew"
+            f"{where}: its digits add up to {total}, not {line[-1]}: a damaged line; take the list"
+            " anew"
         )
     for what, (begin, end) in NUMBERS[line[0]].items():
         part = line[begin:end].strip()
@@ -426,7 +433,8 @@ def _values(row: dict[str, str], where: str) -> Row:
             values[name] = math.nan
         if not low <= values[name] <= high:
             raise InputError(
-                f"{where}: {name} = {shortened(text)!r}; write {low:g} to {high:g}, or leave it empty"
+                f"{where}: {name} = {shortened(text)!r}; write {low:g} to {high:g}, or leave it"
+                " empty"
             )
     if "amplitude_mag" in values or "flash_s" in values or "period_s" in values:
         if "period_s" not in values or "amplitude_mag" not in values:
@@ -435,7 +443,8 @@ def _values(row: dict[str, str], where: str) -> Row:
             )
         if values.get("flash_s", 0.0) > values["period_s"] / 2:
             raise InputError(
-                f"{where}: flash_s is over half of period_s; leave it out: the light then goes up and down"
+                f"{where}: flash_s is over half of period_s; leave it out: the light then goes up"
+                " and down"
             )
     return values
 

@@ -187,7 +187,8 @@ def field_of_180_deg() -> FailureCase:
         "a field of 179.8 degrees",
         "float32 directions",
         f"{fault:.2g} px off at its edge, of 1000",
-        f"{error:.1e} px off; but a degree at the edge is {spread:.2g} times as long as one in the middle",
+        f"{error:.1e} px off; but a degree at the edge is {spread:.2g} times as long as one in the"
+        " middle",
         "float64; the perspective itself diverges at 180 degrees, as a flat monitor does",
         Figures(error, fault, EDGE_PX),
     )
@@ -318,7 +319,8 @@ def half_turn() -> FailureCase:
         "the normalised straight line",
         f"up to {fault / 3600:.1f} degrees off, and still on the great circle",
         f"{error:.0e} arcsec off",
-        "SLERP turns at a constant rate, right up to the half turn where two ways are equally short",
+        "SLERP turns at a constant rate, right up to the half turn where two ways are equally"
+        " short",
         Figures(error, fault, ANGLE_ARCSEC),
     )
 
@@ -353,7 +355,8 @@ def fast_turns() -> FailureCase:
     return FailureCase(
         f"{TURNS_DEG[0]:g} to {TURNS_DEG[-1]:g} degrees from sample to sample",
         "samples without rates",
-        f"{just_under:.0e} degrees off at {TURNS_DEG[1]:g}, {just_over:.0f} at {TURNS_DEG[2]:g}: the other way is shorter",
+        f"{just_under:.0e} degrees off at {TURNS_DEG[1]:g}, {just_over:.0f} at {TURNS_DEG[2]:g}:"
+        " the other way is shorter",
         f"with rates: {error:.0e} arcsec off",
         "the rates say which way, and how often round; send them, or more than two samples a turn",
         Figures(error, fault, ANGLE_ARCSEC),

@@ -64,7 +64,10 @@ HALF_DN = 0.5  # an ADC's rounding
 def bluest_star() -> FailureCase:
     """B-V = -0.4, the bluest of Hipparcos."""
     library = load_library()
-    why = "B-V saturates: there 0.01 mag is thousands of K. Pickles keeps the spectrum of its bluest star"
+    why = (
+        "B-V saturates: there 0.01 mag is thousands of K. Pickles keeps the spectrum of its bluest"
+        " star"
+    )
     return _colour(-0.4, int(np.argmin(library.bv_mag)), BLUE_ERROR, why)
 
 
@@ -72,7 +75,10 @@ def reddest_star() -> FailureCase:
     """B-V = 5.5, past the reddest of Hipparcos."""
     library = load_library()
     plain = np.where(library.vi_mag < 2.0, library.bv_mag, -np.inf)
-    why = "a carbon star's B-V is absorption, not temperature. Without V-I Pickles keeps its reddest K giant"
+    why = (
+        "a carbon star's B-V is absorption, not temperature. Without V-I Pickles keeps its reddest"
+        " K giant"
+    )
     return _colour(5.5, int(np.argmax(plain)), RED_ERROR, why)
 
 
@@ -188,8 +194,10 @@ def cool_stars() -> FailureCase:
     return FailureCase(
         f"AGS, stars under {COOL_K:.0f} K",
         "one average for every colour (AGS)",
-        f"median error {100 * fault:.0f} % over {cool.sum()} real spectra, maximum {100 * average.max():.0f} %",
-        f"pickles, each star held out: median error {100 * error:.1f} %, maximum {100 * ours.max():.0f} %",
+        f"median error {100 * fault:.0f} % over {cool.sum()} real spectra, maximum"
+        f" {100 * average.max():.0f} %",
+        f"pickles, each star held out: median error {100 * error:.1f} %, maximum"
+        f" {100 * ours.max():.0f} %",
         "most of a cool star's light is redder than V, where AGS assumes a body of 9602 K",
         Figures(error, fault, COOL_MEDIAN),
     )
@@ -313,7 +321,8 @@ def empty_field() -> FailureCase:
         "an empty field",
         "light / its brightest pixel",
         f"NaN in {int(np.isnan(scaled).sum())} pixels",
-        f"{stars} stars, mean {dn.mean():.2f} DN for 2400 e- and an offset of 100, {error:.1f} standard errors off",
+        f"{stars} stars, mean {dn.mean():.2f} DN for 2400 e- and an offset of 100, {error:.1f}"
+        " standard errors off",
         "nothing is scaled to a frame's own light",
         Figures(error, standard_errors(scaled, 200.0, sigma_dn), STANDARD_ERRORS),
     )
@@ -330,7 +339,8 @@ def no_exposure() -> FailureCase:
         "exposure 0 s",
         "electrons / exposure",
         f"NaN in {int(np.isnan(rate).sum())} pixels",
-        f"{stars} stars in view, no electrons: mean {dn.mean():.2f} DN, sigma {dn.std():.2f}, {error:.1f} standard errors off",
+        f"{stars} stars in view, no electrons: mean {dn.mean():.2f} DN, sigma {dn.std():.2f},"
+        f" {error:.1f} standard errors off",
         "rates are multiplied by the exposure; bias and read noise remain",
         Figures(error, standard_errors(rate, 100.0, sigma_dn), STANDARD_ERRORS),
     )

@@ -51,7 +51,10 @@ fetch("/control/blank", request).then((answer) => done(answer.status));
 """
 # On request alone, and until it is ended.
 SCENARIO = '[[fault]]\nname = "ghost"\nkind = "false-star"\nradec_deg = [84.0, -1.0]\nv_mag = 2.0\n'
-ALL_DISABLED = "[...document.querySelectorAll('.controls-panel :is(button, input, select)')].every((field) => field.disabled)"
+ALL_DISABLED = (
+    "[...document.querySelectorAll('.controls-panel :is(button, input, select)')].every((field) =>"
+    " field.disabled)"
+)
 
 
 @dataclass
@@ -156,7 +159,8 @@ def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
         f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {wanted[0]}) < 1e-4"
     )
     live.until(
-        f"Math.abs(parseFloat(document.getElementById('dec').textContent.replace('\u2212', '-')) - {wanted[1]}) < 1e-4"
+        "Math.abs(parseFloat(document.getElementById('dec').textContent.replace('\u2212', '-')) -"
+        f" {wanted[1]}) < 1e-4"
     )
 
 

@@ -84,7 +84,8 @@ def test_nothing_reaches_out_of_the_window_or_the_file(page, session, size_px, s
     assert page.run("return document.documentElement.scrollWidth") <= size_px[0]
     assert (
         page.run(
-            "return performance.getEntriesByType('resource').filter(each => !each.name.startsWith('data:')).length"
+            "return performance.getEntriesByType('resource').filter(each =>"
+            " !each.name.startsWith('data:')).length"
         )
         == 0
     )
@@ -101,7 +102,8 @@ def test_printed_on_a4_no_picture_is_cut(page, session):
     page.size(*A4_PX)
     page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     heights = page.run(
-        "return [...document.querySelectorAll('.card, figure')].map(each => each.getBoundingClientRect().height)"
+        "return [...document.querySelectorAll('.card, figure')].map(each =>"
+        " each.getBoundingClientRect().height)"
     )
     whole = page.run(
         "return getComputedStyle(document.querySelector('.card.pictured')).breakInside"

@@ -190,7 +190,8 @@ def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
 
 def test_an_event_leads_to_its_moment_and_to_the_picture_nearest_to_it(report, report_file):
     report.run(
-        "[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind === 'stale').click()"
+        "[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind ==="
+        " 'stale').click()"
     )
     assert report.text("#attitude-state") == "at 5 s"
     pictures = run_data_of(report_file.read_text())["pictures"]

@@ -171,7 +171,8 @@ def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_kill
     assert last.returncode == 0, last.stderr
     for said in ((folder / "driver.log").read_text(), last.stderr):
         assert re.search(
-            rf"worker tcp://\S+ is refused: it has hilstar 99.0, and the campaign is of {hilstar.__version__}",
+            r"worker tcp://\S+ is refused: it has hilstar 99.0, and the campaign is of"
+            rf" {hilstar.__version__}",
             said,
         )
     assert (folder / "out/cases.parquet").read_bytes() == pool_table

@@ -332,10 +332,10 @@ def test_without_opengl_verify_measures_the_same(small_bench_file, no_opengl):
 
 def test_where_numpy_draws_moderngl_is_not_imported(small_bench_file, tmp_path, no_opengl):
     script = (
-        "import sys; from hilstar.cli import run_command\n"
-        f"words = ['frame', {str(small_bench_file)!r}, '--radec', '1,2,3', '-o', {str(tmp_path / 'x.fits')!r}]\n"
-        "assert not run_command(words)\n"
-        "print('moderngl' in sys.modules)"
+        "import sys; from hilstar.cli import run_command\nwords = ['frame',"
+        f" {str(small_bench_file)!r}, '--radec', '1,2,3', '-o',"
+        f" {str(tmp_path / 'x.fits')!r}]\nassert not run_command(words)\nprint('moderngl' in"
+        " sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-c", script],

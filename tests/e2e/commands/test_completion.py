@@ -88,7 +88,10 @@ def test_tab_in_a_real_bash_completes_an_option_and_the_line_runs(env):
 def test_bash_is_given_the_word(env, line, word):
     profile = installed(env)
     words = line.split()
-    ask = f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _hilstar_completion hilstar; echo ${{COMPREPLY[@]}}"
+    ask = (
+        f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _hilstar_completion hilstar; echo"
+        " ${COMPREPLY[@]}"
+    )
     done = subprocess.run(
         [str(BASH), "--norc", "-c", f"source {profile}; {ask}"],
         env=env,
@@ -120,7 +123,10 @@ def test_zsh_gets_its_script(env):
 def test_completing_needs_no_numpy_and_a_command_no_pydantic():
     # Half of the time that Tab would take; 0.17 s of processor time without, 0.30 s with it. A
     # command: 0.33 and 0.44 s.
-    code = "import hilstar.cli, sys; print('numpy' in sys.modules); hilstar.cli.run_command(['frame', 'none.toml'])"
+    code = (
+        "import hilstar.cli, sys; print('numpy' in sys.modules); hilstar.cli.run_command(['frame',"
+        " 'none.toml'])"
+    )
     found = subprocess.run(
         [sys.executable, "-c", f"{code}; print('pydantic' in sys.modules)"],
         capture_output=True,

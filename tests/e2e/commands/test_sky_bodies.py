@@ -281,8 +281,8 @@ def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodi
             'only "vizard" (Basilisk) sends the spacecraft\'s place',
         ),
         (
-            DATED
-            + '[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\nuse_velocity = false\n',
+            DATED + '[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\nuse_velocity ='
+            " false\n",
             "takes the source's place and velocity; leave use_velocity out",
         ),
         (
@@ -427,7 +427,10 @@ def test_a_log_without_dates_gives_none(bodies_file):
 
 
 def test_without_a_source_s_message_the_earth_is_not_there_and_explain_says_so(small_bench_file):
-    source = '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\n'
+    source = (
+        '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "source"\n[attitude]\nsource ='
+        ' "vizard"\n'
+    )
     small_bench_file.write_text(small_bench_file.read_text() + DATED + source)
     folder = small_bench_file.parent
     done = run_hilstar_here(

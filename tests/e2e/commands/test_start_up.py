@@ -69,7 +69,10 @@ def test_a_run_begins_no_other_process_by_what_it_imports():
     """As the own search of glfw would, whose process says a traceback where a signal ends the
     start-up meanwhile.
     """
-    program = "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen' else None)\n"
+    program = (
+        "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen'"
+        " else None)\n"
+    )
     program += "import hilstar.cli.serve, hilstar.server.screen.gate; print('glfw' in sys.modules)"
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")

@@ -172,7 +172,10 @@ def test_a_huge_body_is_refused_and_the_page_goes_on(open_run):
         assert (
             page.ask("/control/mark", "POST", b'{"text": "' + b"x" * size + b'"}', JSON)[0] == 413
         )
-    head = f"POST /control/mark HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\nAuthorization: Bearer {page.token}\r\n"
+    head = (
+        f"POST /control/mark HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\nAuthorization: Bearer"
+        f" {page.token}\r\n"
+    )
     head += "Content-Type: application/json\r\n"
     asked = raw(
         page.port, (head + "Content-Length: 99999999999\r\nExpect: 100-continue\r\n\r\n").encode()

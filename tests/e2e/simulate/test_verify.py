@@ -100,7 +100,10 @@ PLANTED = {
         ],
     ),
     "all": (
-        "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]\nfocal_length_px = 2102.36",
+        (
+            "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]\nfocal_length_px ="
+            " 2102.36"
+        ),
         [
             "the plate scale is -(0.9|1.0)",
             r"the field is shifted by \(-9\.6\d, -5\.0\d\) px",
@@ -179,8 +182,8 @@ def test_a_missing_black_level_is_caught(tmp_path):
         rows = "\n".join(f"{code},{black + value!r}" for code, value in enumerate(light.tolist()))
         (tmp_path / f"{name}.csv").write_text(f"code,w\n{rows}\n")
         (tmp_path / f"{name}.toml").write_text(
-            '[calibration]\nkind = "photometric"\nwho = "a test"\nwhen = "2026-11-21"\ninstrument = "none"\nunit = "relative"\n'
-            f'bits = 10\nresponse = "{name}.csv"\n'
+            '[calibration]\nkind = "photometric"\nwho = "a test"\nwhen = "2026-11-21"\ninstrument'
+            f' = "none"\nunit = "relative"\nbits = 10\nresponse = "{name}.csv"\n'
         )
     assumed = ("bits = 10", 'bits = 10\ncalibration = "assumed.toml"')
     code, summary = verified(tmp_path, 'true_calibration = "true.toml"', replace=assumed)

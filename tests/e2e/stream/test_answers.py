@@ -248,7 +248,10 @@ def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(
         f'{{ name = "{name}", at = {4 * k}, type = "f32" }}'
         for k, name in enumerate(("qw", "qx", "qy", "qz"))
     )
-    keys = 'source = "file"\npath = "tracker.bin"\nformat = "frame"\nframing = "fixed"\nlength = 20\nchecksum = "crc32"\n'
+    keys = (
+        'source = "file"\npath = "tracker.bin"\nformat = "frame"\nframing = "fixed"\nlength ='
+        ' 20\nchecksum = "crc32"\n'
+    )
     body = struct.pack("<4f", *Q)
     frame = body + zlib.crc32(body).to_bytes(4, "big")
     path.touch()
@@ -264,7 +267,7 @@ def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(
             lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 10,
             "what is dropped",
         )
-        (answer, *_) = gathered(source, 1, lambda: append(2 * frame))
+        answer, *_ = gathered(source, 1, lambda: append(2 * frame))
         assert np.allclose(answer.q_icrs_to_cam, Q, atol=1e-7)
         assert notices.counts().get("receiver-failed", 0) == 0
 
@@ -291,8 +294,8 @@ def test_a_recorded_file_is_decoded_and_explained(tmp_path):
     assert [row["t_ns"] for row in said["answers"][:3]] == [10, 11, 12]
     explained = run_hilstar_here(*given, "--explain", "--quaternion", "0.6,0,-0.8,0").stdout
     assert (
-        'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame = "cam" }'
-        in explained
+        'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame ='
+        ' "cam" }' in explained
     )
     assert_refused(run_hilstar_here(*given[:3], tmp_path / "none.bin"), 2, "none.bin")
 
@@ -324,8 +327,8 @@ def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
         tracker = tmp_path / "tracker.jsonl"
         tracker.touch()
         (tmp_path / "bench.toml").write_text(
-            SMALL_BENCH
-            + '\n[attitude]\nsource = "udp"\n[answers]\nsource = "file"\npath = "tracker.jsonl"\nformat = "json"\n'
+            SMALL_BENCH + '\n[attitude]\nsource = "udp"\n[answers]\nsource = "file"\npath ='
+            ' "tracker.jsonl"\nformat = "json"\n'
         )
         over = threading.Event()
 
@@ -367,7 +370,10 @@ def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers
     tmp_path, caplog, poison
 ):
     (tmp_path / "looping_tracker.py").write_text(LOOPING)
-    keys = f'source = "udp"\nbind = "127.0.0.1:{(port := free_port())}"\nformat = "python:looping_tracker:decode"'
+    keys = (
+        f'source = "udp"\nbind = "127.0.0.1:{(port := free_port())}"\nformat ='
+        ' "python:looping_tracker:decode"'
+    )
     to = ("127.0.0.1", port)
     with (
         reading(tmp_path, keys) as source,

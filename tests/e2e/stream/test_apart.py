@@ -134,7 +134,8 @@ def seen_late_ns(link, put) -> int:
 
 @pytest.mark.parametrize("road", [zmq_road, serial_road, udp_road, nasa42_road])
 @best_of_three(
-    "the sender and the lock are of one process: what it waits for a core between them counts as late"
+    "the sender and the lock are of one process: what it waits for a core between them counts as"
+    " late"
 )
 def test_a_packet_is_stamped_while_the_process_that_draws_holds_pythons_lock(road):
     with road() as (link, put):

@@ -241,7 +241,10 @@ def client(port: int, server: Path, own: Path | None) -> Iterator[zmq.Socket]:
 def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_are_told(tmp_path):
     mine, late = make_client(tmp_path / "mine"), make_client(tmp_path / "late")
     allowed = mine / "allowed_clients"
-    keys = 'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients = "mine/allowed_clients"'
+    keys = (
+        'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients ='
+        ' "mine/allowed_clients"'
+    )
 
     def heard(served: Served, own: Path, first: int, patience_s: float = PATIENCE_S) -> bool:
         """Whether the ledger's count of frames shows an attitude of this client: a fresh one is

@@ -38,7 +38,8 @@ def tables(port: int, answers: int) -> str:
     attitude = f'[attitude]\nsource = "udp"\nbind = "127.0.0.1:{port}"\n'
     return (
         attitude
-        + f'[answers]\nsource = "udp"\nbind = "127.0.0.1:{answers}"\nformat = "packet"\nclock = "host"\n'
+        + f'[answers]\nsource = "udp"\nbind = "127.0.0.1:{answers}"\nformat = "packet"\nclock ='
+        ' "host"\n'
     )
 
 

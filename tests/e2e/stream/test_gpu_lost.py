@@ -73,10 +73,13 @@ def planted(
     log = still_log(folder / "still.csv", seconds=LOG_S)
     how = more.get("how", "--headless")
     command = ["replay", str(bench), str(log), how, "--json", "--ledger", str(ledger)]
-    return run_started(
-        [sys.executable, "-c", PLANTED, harm, str(table), str(slept_s), *command],
-        env=more.get("env"),
-    ), ledger
+    return (
+        run_started(
+            [sys.executable, "-c", PLANTED, harm, str(table), str(slept_s), *command],
+            env=more.get("env"),
+        ),
+        ledger,
+    )
 
 
 def events_of(ledger: Path) -> list[str]:

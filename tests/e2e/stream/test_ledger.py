@@ -180,7 +180,10 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
             "--duration",
             "2",
         ]
-        limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES}, {LIMIT_BYTES}))"
+        limited = (
+            f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES},"
+            f" {LIMIT_BYTES}))"
+        )
         program = f"{limited}; from hilstar.cli import main; main()"
         pipe = subprocess.PIPE
         with Started(

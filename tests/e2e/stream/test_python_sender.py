@@ -133,7 +133,10 @@ def test_a_road_that_is_none_is_refused():
 
 
 def test_a_simulator_that_imports_it_brings_no_renderer_and_no_catalogue():
-    code = "import sys, hilstar; hilstar.Sender; print(*({'moderngl', 'glfw', 'astropy', 'matplotlib'} & set(sys.modules)))"
+    code = (
+        "import sys, hilstar; hilstar.Sender; print(*({'moderngl', 'glfw', 'astropy', 'matplotlib'}"
+        " & set(sys.modules)))"
+    )
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

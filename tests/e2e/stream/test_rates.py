@@ -179,6 +179,7 @@ def test_in_lockstep_it_is_told_though_no_rate_is_drawn_by(tmp_path):
             asker.recv()
         until_said(
             process,
-            "send rad/s: the quaternions turn at 0.5 deg/s, the rates say 0.5 rad/s (28.6 deg/s); nothing is drawn",
+            "send rad/s: the quaternions turn at 0.5 deg/s, the rates say 0.5 rad/s (28.6 deg/s);"
+            " nothing is drawn",
         )
         process.kill()

@@ -356,7 +356,10 @@ def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
         assert run_hilstar_here("keys", "-o", tmp_path / directory).returncode == 0
     assert_refused(run_hilstar_here("keys", "-o", tmp_path / "mine"), 2, "in use")
     assert (tmp_path / "mine" / "server.key_secret").stat().st_mode & 0o077 == 0
-    keys = 'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients = "mine/allowed_clients"'
+    keys = (
+        'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients ='
+        ' "mine/allowed_clients"'
+    )
     with serving(tmp_path, port, attitude=keys) as process:
         for directory, waits in (("strange", "1"), ("mine", "10")):
             client = tmp_path / directory / "client.key_secret"

@@ -168,9 +168,9 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
     crash.
     """
     before = (
-        "import os, signal, _moderngl\nmake = _moderngl.make_uniform\n"
-        "def told(*arguments):\n    os.kill(os.getpid(), signal.SIGINT)\n    return make(*arguments)\n"
-        "_moderngl.make_uniform = told"
+        "import os, signal, _moderngl\nmake = _moderngl.make_uniform\ndef told(*arguments):\n   "
+        " os.kill(os.getpid(), signal.SIGINT)\n    return make(*arguments)\n_moderngl.make_uniform"
+        " = told"
     )
     with running(
         program(
@@ -193,12 +193,11 @@ def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_
     qsort does, with no numba.
     """
     before = (
-        "import ctypes, os, signal\nfrom hilstar.instruments.study.speed import benchmark\n"
-        "kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)\n"
-        "def told(*pair):\n    os.kill(os.getpid(), signal.SIGINT)\n    return 0\n"
-        "def draw(*arguments):\n    ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(told))\n"
-        "    print('drawn', flush=True)\n"
-        "benchmark.METHODS = (('callback', 'calls Python', lambda: draw),)"
+        "import ctypes, os, signal\nfrom hilstar.instruments.study.speed import benchmark\nkind ="
+        " ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)\ndef told(*pair):\n   "
+        " os.kill(os.getpid(), signal.SIGINT)\n    return 0\ndef draw(*arguments):\n   "
+        " ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(told))\n    print('drawn',"
+        " flush=True)\nbenchmark.METHODS = (('callback', 'calls Python', lambda: draw),)"
     )
     with running(
         program("benchmark", "-o", tmp_path / "times", before=before), text=True
@@ -214,10 +213,10 @@ def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
     lock of what it waits for.
     """
     before = (
-        "import os, signal\nfrom hilstar.basics.process.scheduling import HostClock\nwait = HostClock.wait_until\n"
-        "def told(clock, due_ns, stop):\n    with stop._cond:\n        os.kill(os.getpid(), signal.SIGINT)\n"
-        "    return wait(clock, due_ns, stop)\n"
-        "HostClock.wait_until = told"
+        "import os, signal\nfrom hilstar.basics.process.scheduling import HostClock\nwait ="
+        " HostClock.wait_until\ndef told(clock, due_ns, stop):\n    with stop._cond:\n       "
+        " os.kill(os.getpid(), signal.SIGINT)\n    return wait(clock, due_ns,"
+        " stop)\nHostClock.wait_until = told"
     )
     with running(
         program("serve", serve_file(tmp_path, free_port()), "--headless", "--json", before=before),
@@ -247,7 +246,10 @@ def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_pa
     """The ledger's writer never returns from a write: the summary comes all the same, says it,
     and the exit code is 1.
     """
-    still = "import time; from hilstar.attitude.logs import mcap_log as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
+    still = (
+        "import time; from hilstar.attitude.logs import mcap_log as w; w.McapWriter.flush = lambda"
+        " *a: time.sleep(100)"
+    )
     command = [
         "serve",
         str(serve_file(tmp_path, free_port())),

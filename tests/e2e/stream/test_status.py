@@ -93,7 +93,8 @@ def test_elsewhere_a_plain_line_comes_now_and_then(tmp_path, monkeypatch):
     told = [line for line in result.stderr.splitlines() if "; packets " in line]
     assert 2 <= len(told) <= (time.monotonic() - begun_s) / 0.4, result.stderr
     assert re.search(
-        r"attitude RA 84\.0000, Dec -1\.0000, roll 0\.0000 deg, .* ms old; frames \d+ of 150 \([\d.]+/s\)",
+        r"attitude RA 84\.0000, Dec -1\.0000, roll 0\.0000 deg, .* ms old; frames \d+ of 150"
+        r" \([\d.]+/s\)",
         told[-1],
     )
     received = int(re.search(r"packets (\d+) received", told[-1])[1])
@@ -123,7 +124,8 @@ def test_a_run_whose_packets_were_all_refused_says_why_and_what_to_change(tmp_pa
     assert process.returncode == 4
     last = err.splitlines()[-1]
     assert re.fullmatch(
-        r"all \d+ packets from tcp://127.0.0.1:\d+ were refused, \d+ for norm: send unit quaternions, .*",
+        r"all \d+ packets from tcp://127.0.0.1:\d+ were refused, \d+ for norm: send unit"
+        r" quaternions, .*",
         last,
     )
     assert "connected to the sender" in err

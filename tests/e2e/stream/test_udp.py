@@ -280,9 +280,15 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     port = free_port()
     # For a second, and until stdin closes: a machine without a free core takes longer to send more
     # than may come.
-    flood = "import select, socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
+    flood = (
+        "import select, socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1',"
+        " int(sys.argv[1])))\n"
+    )
     flood += "end = time.time() + 1\n"
-    flood += "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _ in range(500)]"
+    flood += (
+        "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _"
+        " in range(500)]"
+    )
     with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
         process.shows()
         with subprocess.Popen(

@@ -148,7 +148,8 @@ def test_what_only_a_person_can_judge_is_said_at_the_first_attitude(tmp_path):
             turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": list(ORION)}),
         ):
             served.await_line(
-                "the first attitude points at RA 84.000, Dec -1.000, roll 0.000 deg; the brightest star in view is"
+                "the first attitude points at RA 84.000, Dec -1.000, roll 0.000 deg; the brightest"
+                " star in view is"
             )
             wait_for(
                 lambda: (

@@ -350,14 +350,16 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
     truth = tables | {
         "tracker": tracker | {"psf_sigma_px": [detector.psf_px] * 2},
         "tracker.detector": true_sensor,
-        "monitor": monitor
-        | {
-            "resolution_px": list(size_px),
-            "calibration": "true-light.toml",
-            "flip_x": mounting.flip_x,
-            "rotate_deg": mounting.rotate_deg,
-            "panel_delay_ms": mounting.delay_ms,
-        },
+        "monitor": (
+            monitor
+            | {
+                "resolution_px": list(size_px),
+                "calibration": "true-light.toml",
+                "flip_x": mounting.flip_x,
+                "rotate_deg": mounting.rotate_deg,
+                "panel_delay_ms": mounting.delay_ms,
+            }
+        ),
         "collimator": {
             "focal_length_mm": round(bench.collimator_mm, 2),
             "geometry": "true-lens.toml",

@@ -425,9 +425,11 @@ def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_si
         )
         begin_ns, end_ns = t0 + 4_006_000_000, t0 + 5_200_000_000
         return [
-            Arrival(end_ns, arrival.event, arrival.raw)
-            if begin_ns < arrival.host_ns < end_ns
-            else arrival
+            (
+                Arrival(end_ns, arrival.event, arrival.raw)
+                if begin_ns < arrival.host_ns < end_ns
+                else arrival
+            )
             for arrival in both
         ]
 

@@ -117,10 +117,16 @@ REFUSED = {
     "t_s [ms],x_px\n1,2\n": ":1: column t_s [ms] states two units",
     "u,x_px\n1,2\n": ":1: column t_s is missing (its columns are u, x_px)",
     "t_s,x_px\n1,2\n3\n": ":3: 1 cells and 2 columns; write a table",
-    "t_s,x_px\n1,2\n3,4,5\n": ":3: 3 cells and 2 columns (a decimal comma, or commas between thousands? write 1234.5)",
+    "t_s,x_px\n1,2\n3,4,5\n": (
+        ":3: 3 cells and 2 columns (a decimal comma, or commas between thousands? write 1234.5)"
+    ),
     "t_s,x_px\n1,2\n3,4,5,6\n": ":3: 4 cells and 2 columns (a decimal comma? write points)",
-    "t_s;x_px\n1,234;2,345\n": "'1,234' is a decimal comma, or a comma between thousands? write 1234.5",
-    "t_s;x_px\n1,23;2.345\n": "'1,23' is a decimal comma, or a comma between thousands? write 1234.5",
+    "t_s;x_px\n1,234;2,345\n": (
+        "'1,234' is a decimal comma, or a comma between thousands? write 1234.5"
+    ),
+    "t_s;x_px\n1,23;2.345\n": (
+        "'1,23' is a decimal comma, or a comma between thousands? write 1234.5"
+    ),
     't_s,x_px\n1,"2\n': "not CSV",
     "1,2\n3,4\n": ":1: column t_s is missing",
     "t_s,x_px\n1,\x00\xff\n": "it is no text: line 2 has a byte 0x00",

@@ -158,9 +158,10 @@ def test_what_was_installed_can_be_uninstalled(bench, name, monkeypatch):
         "there is room7",
     )
     result = run_hilstar_here("service", "uninstall", name)
-    assert (result.returncode, result.stdout) == (0, f"{units / 'hilstar-room7.service'}\n"), (
-        result.stderr
-    )
+    assert (result.returncode, result.stdout) == (
+        0,
+        f"{units / 'hilstar-room7.service'}\n",
+    ), result.stderr
     assert [path.name for path in units.iterdir()] == ["mine.service"]
     assert asked.read_text() == "--user disable --now hilstar-room7.service\n--user daemon-reload\n"
     assert_refused(run_hilstar_here("service", "uninstall", name), 2, "there is none")

@@ -162,8 +162,8 @@ def test_the_budget_of_a_bench_has_the_matrix_and_its_condition_number(tmp_path)
     printed = run_hilstar_here("budget", bench).stdout
     assert f"condition number      {wanted.condition:.2f}, electrons of each channel" in printed
     assert (
-        f"quantum_efficiency_g  r {wanted.e_per_s[1, 0]:.4g} e-/s, g {wanted.e_per_s[1, 1]:.4g} e-/s"
-        in printed
+        f"quantum_efficiency_g  r {wanted.e_per_s[1, 0]:.4g} e-/s, g {wanted.e_per_s[1, 1]:.4g}"
+        " e-/s" in printed
     )
 
 

@@ -171,9 +171,11 @@ def test_each_proposal_alone_is_without_a_beat_and_the_nearest(tmp_path, tracker
 
 def test_the_line_has_the_amount_and_the_proposal(tmp_path):
     line = beat_line(beat_of(bench(tmp_path, {"exposure_s": 0.105})))
-    assert line == (
-        "exposures of 0.105 s are 6.3 refreshes of 60 Hz: a star is off by up to 1 arcsec at 1 deg/s, in a beat of 0.35 s;"
-        " without a beat: [monitor] refresh_hz = 57.1429 or [tracker] exposure_s = 0.1"
+    assert (
+        line
+        == "exposures of 0.105 s are 6.3 refreshes of 60 Hz: a star is off by up to 1 arcsec at 1"
+        " deg/s, in a beat of 0.35 s; without a beat: [monitor] refresh_hz = 57.1429 or"
+        " [tracker] exposure_s = 0.1"
     )
 
 
@@ -202,8 +204,8 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
     assert found.matters and found.proposal.exposure_s is found.proposal.refresh_hz is None
     assert found.proposal.frame_hz == pytest.approx(7.5)
     assert (
-        "trigger the tracker ([sync] port, [tracker] trigger); at [tracker] frame_hz = 7.5 its phase stands still"
-        in beat_line(found)
+        "trigger the tracker ([sync] port, [tracker] trigger); at [tracker] frame_hz = 7.5 its"
+        " phase stands still" in beat_line(found)
     )
 
 

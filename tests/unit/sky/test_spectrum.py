@@ -103,15 +103,23 @@ CURVES = {
     "wavelength_nm,value\n380,0.05\n450,0.61\n520,0.48\n": "",
     "380 0.05\n450 0.61\n520 0.48\n": "",
     "wavelength_nm,window,value\n380,0.95,0.05\n450,0.95,0.61\n520,0.95,0.48\n": "not used: window",
-    "wavelength_nm,qe_percent\n380,5\n450,61\n520,48\n": "column qe_percent is in percent: its numbers are multiplied by 0.01",
-    "Wavelength [nm];Quantum Efficiency [%]\n380;5\n450;61\n520;48\n": "multiplied by 0.01, to be in 1",
+    "wavelength_nm,qe_percent\n380,5\n450,61\n520,48\n": (
+        "column qe_percent is in percent: its numbers are multiplied by 0.01"
+    ),
+    "Wavelength [nm];Quantum Efficiency [%]\n380;5\n450;61\n520;48\n": (
+        "multiplied by 0.01, to be in 1"
+    ),
     "Wavelength (nm),% Transmission\n380,5\n450,61\n520,48\n": "column % Transmission is in %",
     "wavelength (Å)\tQE\n3800\t0.05\n4500\t0.61\n5200\t0.48\n": "multiplied by 0.1, to be in nm",
     "wavelength_um;transmission\n0,380;0,05\n0,450;0,61\n0,520;0,48\n": "with a decimal comma",
     "lambda,T\nnm,%\n380,5\n450,61\n520,48\n": "column T is in %",
     "# wavelength(nm) QE(%)\n380 5\n450 61\n520 48\n": "multiplied by 0.01",
-    "# of a survey, measured\n3800 0.05\n4500 0.61\n5200 0.48\n": "without a unit are taken as angstrom",
-    "wavelength,value\n.38,.05\n.45,.61\n.52,.48\n": "from 0.38 to 0.52 without a unit are taken as um",
+    "# of a survey, measured\n3800 0.05\n4500 0.61\n5200 0.48\n": (
+        "without a unit are taken as angstrom"
+    ),
+    "wavelength,value\n.38,.05\n.45,.61\n.52,.48\n": (
+        "from 0.38 to 0.52 without a unit are taken as um"
+    ),
 }
 
 
@@ -129,16 +137,34 @@ def test_a_curve_is_read_by_its_header_and_in_its_units(tmp_path, text, caplog):
 UNCLEAR = {
     "wavelength_nm,value\n380,0,07\n450,0,85\n": ":2: 3 cells and 2 columns (a decimal comma",
     "380,0,07\n450,0,85\n": ":1: 3 columns, and no header that says which is which",
-    "wavelength_nm,R,G,B\n400,0.1,0.2,0.3\n500,0.1,0.2,0.3\n": ":1: no column value among wavelength_nm, R, G, B",
-    "wavelength_nm,qe,transmission\n400,0.1,0.2\n500,0.1,0.2\n": ":1: column value is there twice (qe, transmission)",
-    "wavelength_nm,qe_percent,tau\n400,1,0.2\n500,1,0.2\n": ":1: column value is there twice (qe_percent, tau)",
-    "wavelength_nm,value [A/W]\n400,0.1\n500,0.1\n": ":1: column value [A/W] is in 'A/W', and 1 is wanted",
-    "wavelength_nm,absorption\n400,0.1\n500,0.1\n": ":1: no column value among wavelength_nm, absorption",
+    "wavelength_nm,R,G,B\n400,0.1,0.2,0.3\n500,0.1,0.2,0.3\n": (
+        ":1: no column value among wavelength_nm, R, G, B"
+    ),
+    "wavelength_nm,qe,transmission\n400,0.1,0.2\n500,0.1,0.2\n": (
+        ":1: column value is there twice (qe, transmission)"
+    ),
+    "wavelength_nm,qe_percent,tau\n400,1,0.2\n500,1,0.2\n": (
+        ":1: column value is there twice (qe_percent, tau)"
+    ),
+    "wavelength_nm,value [A/W]\n400,0.1\n500,0.1\n": (
+        ":1: column value [A/W] is in 'A/W', and 1 is wanted"
+    ),
+    "wavelength_nm,absorption\n400,0.1\n500,0.1\n": (
+        ":1: no column value among wavelength_nm, absorption"
+    ),
     "nu [Hz],value\n400,0.1\n500,0.1\n": ":1: no column wavelength_nm among nu [Hz], value",
-    "wavelength_nm,value\n3800,0.05\n9800,0.01\n": "wavelengths from 3800 to 9800 nm, which look like angstrom",
-    "wavelength_nm,value\n1.0,0.05\n1.7,0.01\n": "wavelengths from 1 to 1.7 nm, which look like um; write wavelength_um",
-    "wavelength_angstrom,value\n380,0.05\n980,0.01\n": "wavelengths from 38 to 98 nm by its column wavelength_angstrom",
-    "wavelength,value\n1100,0.05\n9800,0.01\n": "wavelengths from 1100 to 9800 without a unit; write it in the header",
+    "wavelength_nm,value\n3800,0.05\n9800,0.01\n": (
+        "wavelengths from 3800 to 9800 nm, which look like angstrom"
+    ),
+    "wavelength_nm,value\n1.0,0.05\n1.7,0.01\n": (
+        "wavelengths from 1 to 1.7 nm, which look like um; write wavelength_um"
+    ),
+    "wavelength_angstrom,value\n380,0.05\n980,0.01\n": (
+        "wavelengths from 38 to 98 nm by its column wavelength_angstrom"
+    ),
+    "wavelength,value\n1100,0.05\n9800,0.01\n": (
+        "wavelengths from 1100 to 9800 without a unit; write it in the header"
+    ),
     "wavelength_nm,value\n400,5\n500,61\n": "fractions from 0 to 1",
 }
 

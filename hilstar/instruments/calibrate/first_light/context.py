@@ -123,7 +123,8 @@ class StepOutcome:
         if self.verdict != "done" or not at_end:
             return self
         ends = ", ".join(
-            f"{each.name} {each.value:.4g} is at an end of its model ({each.low:g} to {each.high:g})"
+            f"{each.name} {each.value:.4g} is at an end of its model ({each.low:g} to"
+            f" {each.high:g})"
             for each in at_end
         )
         line = f"{self.line}; but {ends}, so it was not measured and nothing was changed"
@@ -214,7 +215,8 @@ def with_changes(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
         now = getattr(getattr(config, change.table), change.key)
         if (list(now) if isinstance(now, tuple) else now) != change.after:
             raise InputError(
-                f"{file.path}: {change.key} could not be set; write it under [{change.table}] yourself"
+                f"{file.path}: {change.key} could not be set; write it under [{change.table}]"
+                " yourself"
             )
     return BenchFile(file.path, text, config, file.sha256)
 
@@ -428,6 +430,7 @@ class StepContext:
         lower = int(np.floor(code / LIGHT_STEP ** (1 / 2.2)))
         if lower < 1:
             raise InputError(
-                "the tracker is saturated by the darkest code; expose shorter, and write [tracker] exposure_s so"
+                "the tracker is saturated by the darkest code; expose shorter, and write [tracker]"
+                " exposure_s so"
             )
         return lower

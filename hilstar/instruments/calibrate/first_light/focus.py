@@ -148,7 +148,8 @@ def sharpness(
     found = find_stars(image, settings, background)
     if len(found) < MIN_DOTS:
         raise InputError(
-            f"{len(found)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look at the focus"
+            f"{len(found)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look"
+            " at the focus"
         )
     turn = math.radians(turn_deg)
     half_side = dot_side_px / 2 * (abs(math.cos(turn)) + abs(math.sin(turn)))
@@ -169,7 +170,8 @@ def sharpness(
         half -= 1
     if len(dots.values) < MIN_DOTS:
         raise InputError(
-            f"{len(dots.values)} dots stand alone and whole in the image and {MIN_DOTS} are needed; look at the focus"
+            f"{len(dots.values)} dots stand alone and whole in the image and {MIN_DOTS} are needed;"
+            " look at the focus"
         )
     noise = noise or DotNoise()
     shape = _started(dots, dot_side_px, turn)
@@ -428,7 +430,10 @@ def focus(context: StepContext) -> StepOutcome:
     }
     files: tuple[Path, ...] = looked.path, picture
     pictures: tuple[Path, ...] = (picture,)
-    line = f"PSF sigma {sigma:.3f} +- {error:.3f} px, the bench file says {wanted:.4g}; dots at code {code}"
+    line = (
+        f"PSF sigma {sigma:.3f} +- {error:.3f} px, the bench file says {wanted:.4g}; dots at code"
+        f" {code}"
+    )
     line += f", a monitor pixel is {pixel_px:.3f} px"
     effective = _effective(looked, found)
     if effective is not None:
@@ -436,17 +441,29 @@ def focus(context: StepContext) -> StepOutcome:
         draw_effective(drawn, effective)
         files, pictures = (*files, drawn), (picture, drawn)
         figures["effective_psf_rms"] = effective.chosen.rms
-        line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
+        line += (
+            f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the"
+            " field"
+        )
     number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:.4g}")
     verdict: Verdict = "done"
     if not found.has_settled:
-        why = f"the fit of the dots has not settled in {ROUNDS} rounds: look at the dots' image, and at the focal lengths"
+        why = (
+            f"the fit of the dots has not settled in {ROUNDS} rounds: look at the dots' image, and"
+            " at the focal lengths"
+        )
         line, verdict = f"{line}: {why}", "failed"
     elif error > MAX_ERROR_SHARE * sigma:
-        why = f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer [tracker] exposure_s"
+        why = (
+            f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer"
+            " [tracker] exposure_s"
+        )
         line, verdict = f"{line}: {why}", "failed"
     elif sigma > BLURRED * wanted + BLURRED_BY_PX:
-        cure = "turn the focus until this figure is smallest (--again focus), or write [tracker] psf_sigma_px as it is"
+        cure = (
+            "turn the focus until this figure is smallest (--again focus), or write [tracker]"
+            " psf_sigma_px as it is"
+        )
         line, verdict = f"{line}: {cure}", "failed"
     fitted = (FittedFigure("PSF sigma", sigma, *SIGMAS_PX),)
     return StepOutcome(verdict, line, figures, files, pictures, number=number, fitted=fitted)

@@ -89,7 +89,8 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
     side = max(3, math.ceil(SQUARE_TRACKER_PX * ratio))
     if reach < SQUARES[0] * side:
         raise InputError(
-            "the tracker sees too little of the monitor for a figure; look at the focal lengths and pixel pitches"
+            "the tracker sees too little of the monitor for a figure; look at the focal lengths and"
+            " pixel pitches"
         )
     (middle_x,), (middle_y,) = geometry.to_monitor(
         *(np.array([(size - 1) / 2]) for size in tracker.resolution_px)
@@ -190,8 +191,9 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     if (step < MIN_LIGHT_STEP).any():
         told = ", ".join(f"{each:.3g}" for each in light[brightest])
         raise SquaresAlike(
-            f"the three brightest spots have {told} DN in all and cannot be told apart, where squares of three sizes have 9, 4"
-            " and 1 parts; look at stray light and reflections, or expose shorter"
+            f"the three brightest spots have {told} DN in all and cannot be told apart, where"
+            " squares of three sizes have 9, 4 and 1 parts; look at stray light and reflections,"
+            " or expose shorter"
         )
     right, down = ((values * offset).sum(axis=(1, 2)) / light for offset in (dx, dy))
     which = largest[brightest]
@@ -212,7 +214,8 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     scale = float(np.sqrt(abs(np.linalg.det(seen))))
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
         raise InputError(
-            f"the figure is {scale:.2f} times as large as the bench file says; look at focal lengths and pitches"
+            f"the figure is {scale:.2f} times as large as the bench file says; look at focal"
+            " lengths and pitches"
         )
     ways = {way: np.array(way, dtype=np.float64).reshape(2, 2) for way in WAYS}
     way = max(ways, key=lambda each: float((ways[each] * seen).sum()))
@@ -220,8 +223,8 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     longest, shortest = np.linalg.svd(left, compute_uv=False)
     if longest > MAX_STRETCH * shortest:
         raise InputError(
-            f"the figure is no square: {longest / shortest:.2f} times as long one way as the other; look at stray light, and at"
-            " how far the screen is tilted"
+            f"the figure is no square: {longest / shortest:.2f} times as long one way as the other;"
+            " look at stray light, and at how far the screen is tilted"
         )
     turn = float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1])))
     sides = np.degrees([np.arctan2(left[1, 0], left[0, 0]), np.arctan2(-left[0, 1], left[1, 1])])
@@ -250,7 +253,10 @@ def look_of(way: tuple[int, int, int, int]) -> str:
     """Where the figure's squares appear in this orientation, in words."""
     right, below = (way[0], way[2]), (way[1], way[3])
     corner = CORNERS[-right[0] - below[0], -right[1] - below[1]]
-    return f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]} ({WAYS[way]})"
+    return (
+        f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]}"
+        f" ({WAYS[way]})"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -451,8 +457,8 @@ def geometry(context: StepContext) -> StepOutcome:
         "notes": "; ".join(notes_for_a_person(found)) or "none",
     }
     line = (
-        f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f} max;"
-        f" a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
+        f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
+        f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
     )
     files = (output, picture, context.folder / "plan.csv", dark, *paths)
     rms, points = chosen.rms_arcsec, len(found.data)

@@ -424,7 +424,8 @@ class GrabCommand(_ShownHere):
             ) from error
         if not any("{output}" in word for word in self._words):
             raise InputError(
-                f"--grab {command}: has no {{output}}; write where your command takes the file's name"
+                f"--grab {command}: has no {{output}}; write where your command takes the file's"
+                " name"
             )
         self._shows = any("{pattern}" in word for word in self._words)
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
@@ -448,7 +449,8 @@ class GrabCommand(_ShownHere):
         output.unlink(missing_ok=True)
         if self._shows and pattern.later:
             raise InputError(
-                "a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here"
+                "a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show"
+                " them here"
             )
         if self._shows:
             monitor = file.config.monitor
@@ -480,7 +482,8 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
     command = shortened(shlex.join(words))
     if child.too_much:
         raise NoImage(
-            f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let it say less"
+            f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let"
+            " it say less"
         )
     if code is None:
         raise NoImage(
@@ -533,7 +536,10 @@ class ByHand(_ShownHere):
         meanings.
         """
         legend = "\n".join(f"    {key}  {meaning}" for key, meaning in keys.items())
-        asked = f"now press on the display what the tracker sees, or save its image as {stem}.png (or .fits):\n{legend}"
+        asked = (
+            f"now press on the display what the tracker sees, or save its image as {stem}.png (or"
+            f" .fits):\n{legend}"
+        )
         pressed: list[str] = []
 
         def done() -> bool:
@@ -774,7 +780,8 @@ def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
         )
     if mine.monitor.bits != its.monitor.bits:
         raise InputError(
-            f"{truth.path}: [monitor] bits = {its.monitor.bits} and the bench file says {mine.monitor.bits}"
+            f"{truth.path}: [monitor] bits = {its.monitor.bits} and the bench file says"
+            f" {mine.monitor.bits}"
         )
     if mine.tracker.resolution_px != its.tracker.resolution_px:
         raise InputError(
@@ -782,5 +789,6 @@ def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
         )
     if its.render.bit_stealing:
         raise InputError(
-            f"{truth.path}: [render] bit_stealing is for the bench that shows; leave it out of the truth"
+            f"{truth.path}: [render] bit_stealing is for the bench that shows; leave it out of the"
+            " truth"
         )

@@ -50,8 +50,14 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
         '<section class="card"><header><h2>The bench file</h2></header><div class="words">',
         f"<p>{escaped(beats)}</p>" if beats else "",
         f"<pre>{escaped(difference or 'nothing was changed')}</pre></div>",
-        f"<details><summary>Details</summary><p>{escaped(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
-        f"<p>hilstar {escaped(session.hilstar)}; images: {escaped(session.seen_by)}</p></details></section>",
+        (
+            f"<details><summary>Details</summary><p>{escaped(bench)}, SHA-256"
+            f" <code>{session.bench_sha256}</code></p>"
+        ),
+        (
+            f"<p>hilstar {escaped(session.hilstar)}; images:"
+            f" {escaped(session.seen_by)}</p></details></section>"
+        ),
     ]
     path = folder / PAGE_FILE
     write_whole(path, page_of(f"First light of {bench.name}", body))
@@ -75,7 +81,10 @@ def _banner(records: list[StepRecord]) -> str:
 
 def _link(record: StepRecord) -> str:
     words = f"{record.name}: {WORDS[record.verdict]}"
-    return f'<a href="#{record.name}" data-state="{STATES[record.verdict]}"><span class="chip">{escaped(words)}</span></a>'
+    return (
+        f'<a href="#{record.name}" data-state="{STATES[record.verdict]}"><span'
+        f' class="chip">{escaped(words)}</span></a>'
+    )
 
 
 def _card(folder: Path, step: SessionStep, record: StepRecord, session: SessionFile) -> str:
@@ -83,7 +92,8 @@ def _card(folder: Path, step: SessionStep, record: StepRecord, session: SessionF
     return "\n".join(
         [
             f'<section class="card{" pictured" if pictures else ""}" id="{record.name}">',
-            f'<header data-state="{STATES[record.verdict]}"><h2>{escaped(step.name.capitalize())}</h2>'
+            f'<header data-state="{STATES[record.verdict]}">',
+            f"<h2>{escaped(step.name.capitalize())}</h2>",
             f'<span class="chip">{WORDS[record.verdict]}</span></header><div class="words">',
             *_words(step, record, session),
             f"</div>{pictures[0] if pictures else ''}",
@@ -98,16 +108,23 @@ def _words(step: SessionStep, record: StepRecord, session: SessionFile) -> Itera
     yield f'<p class="small">{escaped(step.measures)}</p>'
     number = record.number
     if number is None:
-        yield f'<p class="number">\N{EM DASH}<small>{"no figure" if record.verdict == "done" else "not known"}</small></p>'
+        absence = "no figure" if record.verdict == "done" else "not known"
+        yield f'<p class="number">\N{EM DASH}<small>{absence}</small></p>'
     else:
         value = measured(number.value, number.error, number.unit)
         yield f'<p class="number">{escaped(value)}<small>{escaped(number.of)}</small></p>'
     yield f"<p>{escaped(capital(record.line))}.</p>"
     if record.verdict == "failed":
         again = f"hilstar first-light {Path(session.bench).name} -o SESSION --again {record.name}"
-        yield f'<p class="note"><b>What to do:</b> {escaped(step.cure)} Then, as before: <code>{escaped(again)}</code></p>'
+        yield (
+            f'<p class="note"><b>What to do:</b> {escaped(step.cure)} Then, as before:'
+            f" <code>{escaped(again)}</code></p>"
+        )
     if record.changes:
-        yield f"<p>Set in the bench file: {'; '.join(f'<code>{escaped(change.line)}</code>' for change in record.changes)}</p>"
+        yield (
+            "<p>Set in the bench file:"
+            f" {'; '.join(f'<code>{escaped(change.line)}</code>' for change in record.changes)}</p>"
+        )
 
 
 def _details(record: StepRecord, pictures: list[str]) -> Iterator[str]:

@@ -109,7 +109,8 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
     cells = int(side // sparsest)
     if cells < MIN_DOTS:
         raise InputError(
-            "the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches"
+            "the tracker sees too little of the monitor for the response; look at focal lengths and"
+            " pixel pitches"
         )
     (x,), (y,) = geometry.to_monitor(
         *(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px)
@@ -124,9 +125,10 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
     margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
     rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
     periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
-    return DotField(
-        left, top, cells * sparsest, rows, columns, monitor_area(geometry, rows, columns)
-    ), periods
+    return (
+        DotField(left, top, cells * sparsest, rows, columns, monitor_area(geometry, rows, columns)),
+        periods,
+    )
 
 
 def _seen(
@@ -145,7 +147,8 @@ def _seen(
         first, last = math.floor(part.min() - margin), math.ceil(part.max() + margin) + 1
         if first < 0 or last > size:
             raise InputError(
-                "the dots are not whole in the tracker's field; look at [collimator] and run the geometry again"
+                "the dots are not whole in the tracker's field; look at [collimator] and run the"
+                " geometry again"
             )
         ends.append(slice(first, last))
     return ends[1], ends[0]
@@ -235,7 +238,10 @@ class LatticeRatio:
         more, less = (_exposed(times) for times in self.times)
         ratio = f"{self.ratio:.5f} +- {self.error:.5f} times"
         code = f"code {self.patch.code} of {self.patch.channel}"
-        return f"{code}: a pixel of every {self.dense}{more} is {ratio} one of every {self.sparse}{less}"
+        return (
+            f"{code}: a pixel of every {self.dense}{more} is {ratio} one of every"
+            f" {self.sparse}{less}"
+        )
 
 
 def _exposed(times: int) -> str:
@@ -476,13 +482,15 @@ class Photometer:
                 break
             if not self.context.source.sets_exposure:
                 raise InputError(
-                    f"one pixel at white saturates the tracker in {self.exposure_s:g} s: let --grab set the exposure"
-                    " ({exposure_s}), turn the monitor's brightness down, or use a photometer (hilstar calibrate plan)"
+                    f"one pixel at white saturates the tracker in {self.exposure_s:g} s: let --grab"
+                    " set the exposure ({exposure_s}), turn the monitor's brightness down, or"
+                    " use a photometer (hilstar calibrate plan)"
                 )
             self.exposure_s /= LESS
         else:
             raise InputError(
-                f"one pixel at white saturates the tracker even in {self.exposure_s:.2g} s; look at stray light"
+                f"one pixel at white saturates the tracker even in {self.exposure_s:.2g} s; look at"
+                " stray light"
             )
         if probe:
             self.exposure_s *= FILL / fill
@@ -578,7 +586,8 @@ class Photometer:
             lights.append(look.sum_dn - dark[at.times])
         if lights[1] <= 0:
             raise InputError(
-                f"dots of code {patch.code} have no light in the tracker; look at what the screen shows"
+                f"dots of code {patch.code} have no light in the tracker; look at what the screen"
+                " shows"
             )
         return lights[0], lights[1]
 

@@ -63,7 +63,10 @@ def photometry(context: StepContext) -> StepOutcome:
     """Measure the response and name its file in the bench file. Raises InputError."""
     monitor = context.file.config.monitor
     if not context.patches:
-        how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
+        how = (
+            "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar"
+            " calibrate photometric`)"
+        )
         return StepOutcome(
             "skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}"
         )
@@ -112,7 +115,10 @@ def photometry(context: StepContext) -> StepOutcome:
         figures["shares_of_white"] = ", ".join(
             f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True)
         )
-    off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
+    off = (
+        f"{figures['bench_file_off_rms_mag']:.3f} mag rms,"
+        f" {figures['bench_file_off_max_mag']:.3f} max"
+    )
     off_mag = response_error_mag(assumed.response, now)
     with chart(before, f"The bench file's response is off by {off}") as (axes,):
         axes.plot(now.light[-len(off_mag) :], off_mag, color=INK)
@@ -136,7 +142,8 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
     ]
     if len(plans[0]) > patches:
         raise InputError(
-            f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for none"
+            f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for"
+            " none"
         )
     return [planned for planned in plans if len(planned) <= patches][-1]
 
@@ -148,7 +155,8 @@ def shares_of_white(file: BenchFile) -> FloatArray:
     primaries = bench_primaries(file.config.monitor, file.folder)
     if primaries is None:
         raise InputError(
-            "[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r to xy_b"
+            "[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r"
+            " to xy_b"
         )
     matrix = channel_matrix(primaries, named_channels(file.config.tracker, file.folder), 1.0)
     return np.asarray(matrix.e_per_s.sum(axis=0))
@@ -172,9 +180,11 @@ def _response_figures(
         "bench_file_off_max_mag": float(np.abs(off).max()),
         "black_level": now.black,
         "black_level_in_bench_file": before.black,
-        "black_level_measured": "yes"
-        if readings.black_known
-        else "no: give --dark, an image with the monitor switched off",
+        "black_level_measured": (
+            "yes"
+            if readings.black_known
+            else "no: give --dark, an image with the monitor switched off"
+        ),
         "held_out_rms_mag": max(each["rms_mag"] for each in held),
         "held_out_p95_mag": max(MAG_PER_RELATIVE * each["p95_percent"] / 100 for each in held),
         "held_out_p95_sigmas": max(each["p95_sigmas"] for each in held),
@@ -216,13 +226,16 @@ def _judged(
     """
     limit_mag = context.file.config.verify.flux_mag
     monitor = context.file.config.monitor
+    is_black_measured = figures["black_level_measured"] == "yes"
+    doubt = "" if is_black_measured else " as the bench file has it, not measured (--dark)"
     line = (
-        f"the bench file's {monitor.calibration} is off by {figures['bench_file_off_rms_mag']:.3f} mag rms,"
+        f"the bench file's {monitor.calibration} is off by {figures['bench_file_off_rms_mag']:.3f}"
+        " mag rms,"
         f" {figures['bench_file_off_max_mag']:.3f} max (gamma {figures['gamma']:.3f}, not"
         f" {figures['gamma_in_bench_file']:.3f});"
-        f" measured: held-out levels {figures['held_out_rms_mag']:.4f} mag rms, {figures['held_out_max_mag']:.4f} max;"
-        f" black {figures['black_level']:.2e} of white"
-        f"{'' if figures['black_level_measured'] == 'yes' else ' as the bench file has it, not measured (--dark)'}"
+        f" measured: held-out levels {figures['held_out_rms_mag']:.4f} mag rms,"
+        f" {figures['held_out_max_mag']:.4f} max;"
+        f" black {figures['black_level']:.2e} of white{doubt}"
     )
     rms_mag = float(figures["held_out_rms_mag"])
     error = rms_mag / math.sqrt(2 * float(figures["codes"]))
@@ -236,9 +249,15 @@ def _judged(
         return StepOutcome("failed", line, figures, files, pictures, number=number)
     is_off = float(figures["held_out_p95_mag"]) > limit_mag
     if is_off and float(figures["held_out_p95_sigmas"]) > SURE_SIGMAS:
-        why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
+        why = (
+            "take more readings (--patches), look at stray light, and at whether the monitor was"
+            " warm"
+        )
         if context.truth is not None and rounds_alike(context.truth.config.tracker.detector):
-            why += "; the virtual tracker's ADC rounds faint codes alike: write the truth's [tracker.detector] read_noise_e"
+            why += (
+                "; the virtual tracker's ADC rounds faint codes alike: write the truth's"
+                " [tracker.detector] read_noise_e"
+            )
         line = f"{line}: the levels do not make one smooth response; {why}"
         return StepOutcome("failed", line, figures, files, pictures, number=number)
     changes = context.names("monitor", "calibration", context.session / "response.toml")

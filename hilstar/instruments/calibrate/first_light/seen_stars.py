@@ -281,13 +281,25 @@ class Scatter:
         """What is wrong and what to do where the scatter is far above its error; else ""."""
         if self.rms_mag <= FAR * self.error_mag:
             return ""
-        told = f"the light of stars scatters by {self.rms_mag:.3f} mag rms where they are known to {self.error_mag:.3f}"
+        told = (
+            f"the light of stars scatters by {self.rms_mag:.3f} mag rms where they are known to"
+            f" {self.error_mag:.3f}"
+        )
         if max(self.by_place, self.by_light) < MOST:
-            why = "it follows neither place nor light: look at stray light, local dimming, and whether the light is steady"
+            why = (
+                "it follows neither place nor light: look at stray light, local dimming, and"
+                " whether the light is steady"
+            )
         elif self.by_place > self.by_light:
-            why = f"{self.by_place:.0%} of it follows the place on the screen: measure that (--again uniformity)"
+            why = (
+                f"{self.by_place:.0%} of it follows the place on the screen: measure that (--again"
+                " uniformity)"
+            )
         else:
-            why = f"{self.by_light:.0%} of it follows the light asked for: measure the response (--again photometry, --patches N)"
+            why = (
+                f"{self.by_light:.0%} of it follows the light asked for: measure the response"
+                " (--again photometry, --patches N)"
+            )
         return f"{told}; {why}"
 
 
@@ -352,11 +364,15 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
 
 
 def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
-    told = f"{len(seen.dn)} stars can be seen where the sky has them, in {fields} fields, and {MIN_STARS} are needed"
+    told = (
+        f"{len(seen.dn)} stars can be seen where the sky has them, in {fields} fields, and"
+        f" {MIN_STARS} are needed"
+    )
     if seen.lost:
         return (
-            f"{told}; {seen.lost} that should be bright enough are not there: measure the response (--again photometry), look"
-            " at [render] flux_at_white_e_per_s, or run the geometry again (--again geometry)"
+            f"{told}; {seen.lost} that should be bright enough are not there: measure the response"
+            " (--again photometry), look at [render] flux_at_white_e_per_s, or run the geometry"
+            " again (--again geometry)"
         )
     wide = (
         f"a star's sigma is {spot.mean_sigma_px:.1f} px"
@@ -364,8 +380,8 @@ def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
         else "the field has few bright stars"
     )
     return (
-        f"{told}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag, so that faint stars are shown"
-        " brighter, or a larger [sky] faintest_v_mag"
+        f"{told}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag,"
+        " so that faint stars are shown brighter, or a larger [sky] faintest_v_mag"
     )
 
 

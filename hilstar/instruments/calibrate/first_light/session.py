@@ -64,7 +64,10 @@ def latency(context: StepContext) -> StepOutcome:
         )
     watched = context.source.diode(context.file, WATCHED_S)
     if watched is None:
-        how = "--diode serial:/dev/ttyX@BAUD, with the display on this machine; or `hilstar latency` with the ledger of a run"
+        how = (
+            "--diode serial:/dev/ttyX@BAUD, with the display on this machine; or `hilstar latency`"
+            " with the ledger of a run"
+        )
         return StepOutcome(
             "skipped",
             f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}",
@@ -92,9 +95,10 @@ def latency(context: StepContext) -> StepOutcome:
     if context.truth is not None:
         figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
     line = (
-        f"the panel's delay is {delay_ms:g} +- {error_ms:.3f} ms, the bench file has {monitor.panel_delay_ms:g};"
-        f" a swap is light at the square after {found['latency_ms']['p50']:.2f} ms,"
-        f" jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
+        f"the panel's delay is {delay_ms:g} +- {error_ms:.3f} ms, the bench file has"
+        f" {monitor.panel_delay_ms:g}; a swap is light at the square after"
+        f" {found['latency_ms']['p50']:.2f} ms, jitter {found['jitter_ms']:.3f}, {found['edges']}"
+        " edges"
     )
     agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
     changes = (
@@ -270,7 +274,8 @@ class FirstLightSession:
         found = read_session(folder)
         if found is not None and found.bench != bench:
             raise InputError(
-                f"{folder}: is the session of {found.bench}; write another directory for {file.path}"
+                f"{folder}: is the session of {found.bench}; write another directory for"
+                f" {file.path}"
             )
         self.records = (
             {}
@@ -290,7 +295,8 @@ class FirstLightSession:
         for number, step in enumerate(STEPS):
             if step.name not in again and self._is_done(number):
                 say(
-                    f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}"
+                    f"{step.name:12} {self.records[step.name].verdict} before:"
+                    f" {self.records[step.name].line}"
                 )
                 continue
             record = self._run(number, step.name in again, say)

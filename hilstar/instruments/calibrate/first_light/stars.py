@@ -79,14 +79,20 @@ def verify(context: StepContext) -> StepOutcome:
         width_px,
         f"{len(seen.place_px)} stars are {rms} from the sky",
     )
-    line = f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them, {noise_words(seen)}"
+    line = (
+        f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them,"
+        f" {noise_words(seen)}"
+    )
     line += f"; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
     pictures = [picture]
     if seen.sure.sum() >= MIN_STARS:
         found, finding = _light_figures(context, seen, light)
         figures |= found
         pictures.append(light)
-        line += f", and {figures['flux_p95_mag']:.3f} mag from its light (95 % of {figures['flux_stars']})"
+        line += (
+            f", and {figures['flux_p95_mag']:.3f} mag from its light (95 % of"
+            f" {figures['flux_stars']})"
+        )
         reasons += [finding] if finding else []
     else:
         line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
@@ -99,17 +105,17 @@ def verify(context: StepContext) -> StepOutcome:
     figures |= {
         "twin_passed": str(twin["passed"]).lower(),
         "twin_stars": twin["stars"],
-        "twin_zero_point_mag": "not known"
-        if twin["zero_point_mag"] is None
-        else twin["zero_point_mag"],
+        "twin_zero_point_mag": (
+            "not known" if twin["zero_point_mag"] is None else twin["zero_point_mag"]
+        ),
         "twin_flux_p95_mag": twin["flux_error_mag"].p95 or 0.0,
         "twin_centroid_p95_px": twin["centroid_error_px"].p95 or 0.0,
     }
     if context.truth is not None:
         figures |= _against_truth(context)
         line += (
-            f"; against the truth, places are {figures['truth_rms_arcsec']:.2f} arcsec rms off, and stars of the twin"
-            f" {figures['twin_flux_p95_mag']:.3f} mag at 95 %"
+            f"; against the truth, places are {figures['truth_rms_arcsec']:.2f} arcsec rms off, and"
+            f" stars of the twin {figures['twin_flux_p95_mag']:.3f} mag at 95 %"
         )
     line += f": {'; '.join(reasons)}" if reasons else ""
     verdict: Verdict = "failed" if reasons else "done"
@@ -167,16 +173,23 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
     beyond = seen.beyond_px
     at_least, at_most = P95_OF_TWO * beyond.low, P95_OF_TWO * beyond.high
     if at_least > limit_px:
-        off = f"beyond their noise stars are {P95_OF_TWO * beyond.sigma:.3f} px off at 95 % (limit {limit_px:g})"
+        off = (
+            f"beyond their noise stars are {P95_OF_TWO * beyond.sigma:.3f} px off at 95 % (limit"
+            f" {limit_px:g})"
+        )
         return [f"{off}: run the geometry again (--again geometry)"]
     wanted = frames_for(seen, limit_px)
     if at_most <= limit_px or wanted == seen.frames:
         return []
     cure = "write a longer [tracker] exposure_s"
     if wanted <= MAX_ASKED_FRAMES:
-        cure = f"{wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker] exposure_s"
+        cure = (
+            f"{wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker]"
+            " exposure_s"
+        )
     return [
-        f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at 95 %; {cure}"
+        f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at"
+        f" 95 %; {cure}"
     ]
 
 
@@ -234,7 +247,10 @@ def _light_figures(
     zero_point = float(np.median(off))
     spread = np.abs(off - zero_point)
     p95 = float(np.percentile(spread, 95))
-    finding = f"the light of {len(off)} stars is {p95:.3f} mag from the sky's at 95 %, {zero_point:+.3f} mag in common"
+    finding = (
+        f"the light of {len(off)} stars is {p95:.3f} mag from the sky's at 95 %, {zero_point:+.3f}"
+        " mag in common"
+    )
     from_middle = np.hypot(*seen.screen[seen.sure].T)
     draw_light(
         picture, seen.e_per_s[seen.sure], off, seen.noise_mag[seen.sure], finding, from_middle
@@ -245,8 +261,9 @@ def _light_figures(
         "flux_rms_mag": float(np.sqrt((spread**2).mean())),
         "flux_p95_mag": p95,
         "flux_max_mag": float(spread.max()),
-        "flux_beyond_noise_p95_mag": P95_OF_ONE
-        * Beyond.of(off - zero_point, seen.noise_mag[seen.sure]).sigma,
+        "flux_beyond_noise_p95_mag": (
+            P95_OF_ONE * Beyond.of(off - zero_point, seen.noise_mag[seen.sure]).sigma
+        ),
         "flux_zero_point_mag": zero_point,
         "flux_scatter_mag": scatter.rms_mag,
         "flux_error_mag": scatter.error_mag,
@@ -266,11 +283,17 @@ def _star_reasons(
         found.append(f"{figures['lost']} bright stars are not there")
     is_off = float(figures.get("flux_beyond_noise_p95_mag", 0.0)) > limits.flux_mag
     if is_off and not is_scattered:
-        off = f"beyond noise the light of stars is {figures['flux_beyond_noise_p95_mag']:.3f} mag off at 95 %"
+        off = (
+            f"beyond noise the light of stars is {figures['flux_beyond_noise_p95_mag']:.3f} mag off"
+            " at 95 %"
+        )
         off += f" (limit {limits.flux_mag:g})"
         found.append(f"{off}: measure the response (photometry)")
     if abs(float(figures.get("flux_zero_point_mag", 0.0))) > limits.flux_mag:
-        off = f"all stars are {figures['flux_zero_point_mag']:+.3f} mag off (limit {limits.flux_mag:g})"
+        off = (
+            f"all stars are {figures['flux_zero_point_mag']:+.3f} mag off (limit"
+            f" {limits.flux_mag:g})"
+        )
         found.append(f"{off}: measure what white is worth (scale)")
     return found
 
@@ -295,7 +318,8 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
     known = np.isfinite(off)
     if not known.any():
         raise InputError(
-            "no place of the screen has a direction both in the bench file and in the truth; look at the truth"
+            "no place of the screen has a direction both in the bench file and in the truth; look"
+            " at the truth"
         )
     rms, largest = float(np.sqrt((off[known] ** 2).mean())), float(off[known].max())
     return {
@@ -322,9 +346,9 @@ def scale(context: StepContext) -> StepOutcome:
     if used.sum() < MIN_STARS:
         saturated = int(np.isinf(seen.noise_mag).sum())
         raise InputError(
-            f"the light of {used.sum()} stars can be read and {MIN_STARS} are needed; of {len(used)}, {saturated} saturate the"
-            f" tracker (a shorter [tracker] exposure_s) and {int(clips.sum())} clip on the monitor (a smaller [render]"
-            " brightest_v_mag)"
+            f"the light of {used.sum()} stars can be read and {MIN_STARS} are needed; of"
+            f" {len(used)}, {saturated} saturate the tracker (a shorter [tracker] exposure_s) and"
+            f" {int(clips.sum())} clip on the monitor (a smaller [render] brightest_v_mag)"
         )
     wanted, noise_mag = seen.e_per_s[used], seen.noise_mag[used]
     ratios = (
@@ -360,7 +384,10 @@ def scale(context: StepContext) -> StepOutcome:
             found.flux_at_white_e_per_s / _white_e_per_s(context.truth)
         )
     figures["scatter_error_mag"] = scatter.error_mag
-    brighter = f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than the bench file has it"
+    brighter = (
+        f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than"
+        " the bench file has it"
+    )
     line = (
         f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
     )
@@ -395,10 +422,14 @@ def scale(context: StepContext) -> StepOutcome:
         wrong.append("they are too noisy: write a longer [tracker] exposure_s")
     if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
         wrong.append(
-            f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {trend_error_mag:.3f} mag"
+            f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +-"
+            f" {trend_error_mag:.3f} mag"
         )
     if wrong:
-        why = "the response is not as the bench file has it (photometry), or the background is not dark; nothing was changed"
+        why = (
+            "the response is not as the bench file has it (photometry), or the background is not"
+            " dark; nothing was changed"
+        )
         return StepOutcome(
             "failed",
             f"{line}, but {' and '.join(wrong)}: {why}",

@@ -137,7 +137,10 @@ def uniformity(context: StepContext) -> StepOutcome:
     elif found.is_even:
         figures["map_error_mag"] = math.hypot(found.error_mag(dots.noise_mag), found.rms_mag)
     picture = context.session / "uniformity.svg"
-    line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
+    line = (
+        f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by"
+        f" {found.left_mag:.4f} mag"
+    )
     line += f" (noise {dots.noise_mag:.4f})"
     draw_uniformity(picture, dots, found, line)
     files: list[Path] = [picture, *images]
@@ -164,7 +167,10 @@ def uniformity(context: StepContext) -> StepOutcome:
         line += "; what the tracker's own lens darkens is part of it"
     noisy = found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
     if noisy:
-        why = "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the images"
+        why = (
+            "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the"
+            " images"
+        )
         line = f"{line}: that is far above their noise: {why}"
     verdict: Verdict = "failed" if noisy else "done"
     darkest = 100 * float(figures["darkest_of_brightest"])
@@ -212,7 +218,8 @@ def warm_up(context: StepContext) -> StepOutcome:
             lit = (looked.image > LIT_SIGMAS * noisiest_background(looked.image).noise) & cold
             if not lit.any():
                 raise InputError(
-                    f"no dot of code {code} is seen; look at the focus, and whether the screen is on"
+                    f"no dot of code {code} is seen; look at the focus, and whether the screen"
+                    " is on"
                 )
             beside = binary_dilation(lit, iterations=RING_PX) & cold & ~lit
         # What black pixels glow more than in the dark frame is no light of the dots.
@@ -298,7 +305,8 @@ def _spacing(context: StepContext) -> DotSpacing:
 def _check_brightness(context: StepContext, looked: DarkSubtracted, code: int) -> None:
     if context.is_too_bright(looked):
         raise InputError(
-            f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step"
+            f"dots of code {code} saturate the tracker; run the focus again (--again focus), then"
+            " this step"
         )
 
 
@@ -309,7 +317,10 @@ def _said(found: UniformityMap, assumed: bool) -> str:
         )
     seen = found.at_dots[found.used]
     rows, columns = found.grid.shape
-    return f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of {rows} x {columns}"
+    return (
+        f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of"
+        f" {rows} x {columns}"
+    )
 
 
 def _figures(

@@ -203,8 +203,9 @@ def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen
 
 def _too_few(data: fits.MatchedDots) -> InputError:
     return InputError(
-        f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed: look at focus, exposure and stray light,"
-        " and at whether the tracker sees the part of the screen where the dots are (plan.csv)"
+        f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed: look at focus,"
+        " exposure and stray light, and at whether the tracker sees the part of the screen where"
+        " the dots are (plan.csv)"
     )
 
 
@@ -226,9 +227,9 @@ def calibrate_geometry(
     poses = int(seen.pose.max()) + 1
     if not tracker_known and poses == 1:
         raise InputError(
-            "with one pose the tracker's own distortion cannot be told from the collimator's; give its flight model as"
-            " [tracker] distortion, take a second pose (turn the tracker by 90 or 180 degrees about its boresight),"
-            " or add --tracker-is-ideal"
+            "with one pose the tracker's own distortion cannot be told from the collimator's; give"
+            " its flight model as [tracker] distortion, take a second pose (turn the tracker by 90"
+            " or 180 degrees about its boresight), or add --tracker-is-ideal"
         )
     tracker_names = () if tracker_known else tuple(fits.TRACKER_STEPS)
     look = first_look(plan, nominal, seen, rng)
@@ -246,8 +247,9 @@ def calibrate_geometry(
     expected, error = calibrated.held_out_noise_arcsec, chosen.rms_arcsec
     if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
         raise InputError(
-            f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the centroids makes {expected:.2g}:"
-            " something moved between the frames, or the tracker's flight model is wrong"
+            f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the"
+            f" centroids makes {expected:.2g}: something moved between the frames, or the tracker's"
+            " flight model is wrong"
         )
     return calibrated
 
@@ -309,9 +311,10 @@ def matched(
         data = match_by_geometry(plan, seen, rough.geometry, reach_px)
         if len(data) < MIN_DOTS:
             break
-    return fits.Problem(
-        plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX
-    ), data
+    return (
+        fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX),
+        data,
+    )
 
 
 def _in_view(
@@ -348,14 +351,23 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
             if here.sum() >= MIN_CELL_DOTS and found[here].sum() < MIN_CELL_SHARE * here.sum():
                 part = "middle" if vertical == sideways else f"{vertical} {sideways}"
                 raise InputError(
-                    f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part} of the screen: look for what"
-                    " covers or dims it, and take new frames"
+                    f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part}"
+                    " of the screen: look for what covers or dims it, and take new frames"
                 )
 
 
-ONE_POSE = "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file holds both"
-COLLIMATOR_ALONE = "one pose, with the tracker's lens as its flight model says: this file holds the collimator alone"
-ROUND = "poses turned about the boresight do not tell apart distortions that are round about it; they are in the stated error"
+ONE_POSE = (
+    "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file"
+    " holds both"
+)
+COLLIMATOR_ALONE = (
+    "one pose, with the tracker's lens as its flight model says: this file holds the collimator"
+    " alone"
+)
+ROUND = (
+    "poses turned about the boresight do not tell apart distortions that are round about it; they"
+    " are in the stated error"
+)
 WIDE_INCH = 5.6  # width of a panel
 ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the screen's width
 
@@ -483,7 +495,10 @@ def lines_of(found: Calibrated) -> list[str]:
     rows = [
         (
             "dots",
-            f"{found.recognised} of {len(found.plan)} recognised in {len(found.problem.q_poses)} pose(s)",
+            (
+                f"{found.recognised} of {len(found.plan)} recognised in"
+                f" {len(found.problem.q_poses)} pose(s)"
+            ),
         ),
         ("centroids", f"{len(found.data)} matched, {found.lost} lost, {found.false} false"),
         ("centroid noise", f"{found.problem.noise_px:.4f} px, {found.noise_arcsec:.2f} arcsec"),
@@ -512,8 +527,9 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
         found.problem.nominal.monitor.resolution_px,
     )
     finding = (
-        f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
-        f" {found.uncertainty.max_arcsec:.2g} at most; held-out dots {found.chosen.rms_arcsec:.2g} rms"
+        f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g}"
+        f" arcsec rms, {found.uncertainty.max_arcsec:.2g} at most; held-out dots"
+        f" {found.chosen.rms_arcsec:.2g} rms"
     )
     dot, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
     residual = fits.residuals_px(found.problem, found.fit.geometry, found.data)

@@ -111,7 +111,8 @@ def _codes(count: int, frames: int, rng: np.random.Generator) -> BoolArray:
     lit = next((codes for codes in tried if codes is not None), None)
     if lit is None:
         raise InputError(
-            f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames or fewer --dots"
+            f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames"
+            " or fewer --dots"
         )
     return lit
 
@@ -199,7 +200,8 @@ class SeenScreen:
         seen = places[self.shows(*places.T)]
         if not len(seen):
             raise InputError(
-                "the tracker sees no place of the screen: look at [collimator] q_cam_to_mon, focal lengths and pixel pitches"
+                "the tracker sees no place of the screen: look at [collimator] q_cam_to_mon, focal"
+                " lengths and pixel pitches"
             )
         return seen.min(axis=0), seen.max(axis=0)
 
@@ -230,8 +232,8 @@ def plan_seen_dots(
     count = dots_of_frames(frames, dots_per_frame)
     if count < MIN_DOTS:
         raise InputError(
-            f"--dots {dots_per_frame}: {frames} frames then hold {count} dots, and {MIN_DOTS} are needed; write more --dots or"
-            " --frames, or no --dots for as many as the field holds"
+            f"--dots {dots_per_frame}: {frames} frames then hold {count} dots, and {MIN_DOTS} are"
+            " needed; write more --dots or --frames, or no --dots for as many as the field holds"
         )
     lit = _codes(count, frames, rng)
     x_px, y_px = _seen_places(seen, count)
@@ -264,8 +266,8 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     chosen = np.concatenate([chosen, inside[far]])[:count]
     if len(chosen) < MIN_DOTS:
         raise InputError(
-            f"the part of the screen that the tracker sees holds {len(chosen)} dots and {MIN_DOTS} are needed:"
-            " a shorter [tracker] or a longer [collimator] focal length shows it more"
+            f"the part of the screen that the tracker sees holds {len(chosen)} dots and {MIN_DOTS}"
+            " are needed: a shorter [tracker] or a longer [collimator] focal length shows it more"
         )
     return chosen[:, 0], chosen[:, 1]
 

@@ -266,7 +266,10 @@ def _why_no_map(
         frame = reorder(seen.frame, plan.frames)
         inside = np.flatnonzero((frame >= 0) & (frame < plan.frames))
         if _map_of(plan, nominal, replace(seen, frame=frame).at(inside), rng) is not None:
-            return f"{where}the frames are {words}: the codes match so; number the frames from 0 as plan.csv does"
+            return (
+                f"{where}the frames are {words}: the codes match so; number the frames from 0 as"
+                " plan.csv does"
+            )
     return (
         f"{where}the codes that were seen match no dots of the plan; give all frames of this plan,"
         " numbered from 0, with at least 12 dots in view"
@@ -351,8 +354,8 @@ def refuse_motion(data: MatchedDots) -> None:
             if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
                 first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
                 raise InputError(
-                    f"the image moved by {np.ptp(shift):.2f} px in {axis} between frames {first} and {last}:"
-                    " fix the tracker and the screen, and take new frames"
+                    f"the image moved by {np.ptp(shift):.2f} px in {axis} between frames {first}"
+                    f" and {last}: fix the tracker and the screen, and take new frames"
                 )
 
 

@@ -67,7 +67,10 @@ def read_observed(path: Path) -> Observed:
             if not (finite and 0 <= frame_number < 10**6 and 0 <= pose_number < 1000):
                 raise ValueError
         except ValueError as error:
-            wanted = "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are wanted"
+            wanted = (
+                "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are"
+                " wanted"
+            )
             raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
         rows.append((frame_number, x, y, sigma, pose_number))
         if len(rows) > MAX_ROWS:
@@ -113,7 +116,8 @@ def measure_images(
     count = [len(x) for x, _ in places]
     if not sum(count):
         raise InputError(
-            f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer"
+            f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or"
+            " expose longer"
         )
     frame_of, pose_of = (
         np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True)
@@ -142,7 +146,8 @@ def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
         frame, pose = int(number[1]), int(pose_number[1]) if pose_number else 0
         if (frame, pose) in found:
             raise InputError(
-                f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]}; {IMAGE_ADVICE}"
+                f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]};"
+                f" {IMAGE_ADVICE}"
             )
         found[frame, pose] = path
     return found
@@ -156,7 +161,8 @@ def _centroids(
     saturated = int((image == top).sum())
     if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
         raise InputError(
-            f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker"
+            f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the"
+            " dots darker"
         )
     above = image if under is None else image - under
     found = find_stars(above, settings, noisiest_background(above))

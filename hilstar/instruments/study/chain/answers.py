@@ -30,7 +30,9 @@ WAYS: dict[str, str] = {
 }
 # What to do about the step that most of a turning scene's error comes from.
 ADVICE: dict[str, str] = {
-    "refresh": "no key of [render] mends it: a faster or a flashing panel does (refresh_hz, hold_ms)",
+    "refresh": (
+        "no key of [render] mends it: a faster or a flashing panel does (refresh_hz, hold_ms)"
+    ),
     "smear": 'draw paths ([render] motion = "on")',
     "depth": "write a larger [sky] faintest_v_mag",
     "codes": "more bits, or bit stealing",

@@ -139,7 +139,8 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     counts = np.array([len(rates) for rates in seen])
     if not counts.any():
         raise InputError(
-            f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger faintest_v_mag"
+            f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger"
+            " faintest_v_mag"
         )
     typical = float(np.median(counts[counts > 0]))
     average = fields[np.argmin(np.abs(counts - typical))]
@@ -203,7 +204,10 @@ def exposure_s(bench: Bench) -> float:
 def shortened_line(bench: Bench) -> str | None:
     """The note for an exposure that is longer than its measured part, or None."""
     whole_s, measured_s = bench.config.tracker.exposure_s, exposure_s(bench)
-    said = f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker] exposure_s = {whole_s:g}"
+    said = (
+        f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker]"
+        f" exposure_s = {whole_s:g}"
+    )
     return None if measured_s == whole_s else said
 
 

@@ -67,7 +67,10 @@ class GlassRow:
     def words(self) -> str:
         """ "a basis of 6: 0.12 arcsec, 0.4 %, 9.1 ms"."""
         error = f"{two_digits(self.error_arcsec)} arcsec, {two_digits(self.error_percent)} %"
-        return f"{self.psf}{f' ({self.chosen})' if self.chosen else ''}: {error}, {two_digits(self.time_ms)} ms"
+        return (
+            f"{self.psf}{f' ({self.chosen})' if self.chosen else ''}: {error},"
+            f" {two_digits(self.time_ms)} ms"
+        )
 
 
 def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow]:

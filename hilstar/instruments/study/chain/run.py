@@ -162,9 +162,11 @@ def scene_line(
     )
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
     return (
-        f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and {own.error_mag:.2g} mag off over"
-        f" {own.stars} stars{f', {own.lost} of them lost' if own.lost else ''}, in {own.time_ms:.3g} ms; {stands};"
-        f" error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage} {share:.0%}"
+        f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and"
+        f" {own.error_mag:.2g} mag off over {own.stars}"
+        f" stars{f', {own.lost} of them lost' if own.lost else ''}, in {own.time_ms:.3g} ms;"
+        f" {stands}; error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage}"
+        f" {share:.0%}"
     )
 
 
@@ -178,7 +180,8 @@ def headline(rows: Sequence[CombinationRow], load: Load) -> str:
     where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
     said = f", not in {', '.join(beaten)}" if beaten else ""
     return load.title(
-        f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
+        'The choice of effort = "auto" is on the front of error against time, or within its noise,'
+        f" {where}{said}"
     )
 
 
@@ -200,8 +203,14 @@ def standing(rows: Sequence[CombinationRow]) -> str:
         return said
     if own_beyond:
         nearest = _nearest(own_beyond)
-        return f"{said}; nor of what effort may choose: {_compared(own, nearest)}: {why_not(own, nearest)}"
-    return f"{said}; on the front of what effort may choose{', within the noise' if beating(rows, as_filed=True)[1] else ''}"
+        return (
+            f"{said}; nor of what effort may choose: {_compared(own, nearest)}:"
+            f" {why_not(own, nearest)}"
+        )
+    return (
+        f"{said}; on the front of what effort may"
+        f" choose{', within the noise' if beating(rows, as_filed=True)[1] else ''}"
+    )
 
 
 def words(row: CombinationRow) -> str:
@@ -216,22 +225,28 @@ def why_not(own: CombinationRow, other: CombinationRow) -> str:
     reasons = []
     if other.bit_stealing != own.bit_stealing:
         reasons.append(
-            "bit stealing is the bench file's choice, for a panel whose primaries are known as the tracker sees them"
+            "bit stealing is the bench file's choice, for a panel whose primaries are known as the"
+            " tracker sees them"
         )
     if other.prediction != own.prediction and own.prediction == "held":
         reasons.append("[attitude] max_extrapolation_ms = 0 is the bench file's choice")
     elif other.prediction != own.prediction:
         reasons.append(
-            f"prediction by {other.prediction} is the sender's choice (whether its packets have rates)"
+            f"prediction by {other.prediction} is the sender's choice (whether its packets have"
+            " rates)"
         )
     if other.faintest_v_mag != own.faintest_v_mag:
         reasons.append("the catalogue's depth is the bench file's choice")
     if other.quantisation == "temporal":
         reasons.append(
-            "temporal is right over an exposure, and effort asks for light that is right in each frame"
+            "temporal is right over an exposure, and effort asks for light that is right in each"
+            " frame"
         )
     elif other.quantisation != own.quantisation:
-        compared = f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase"
+        compared = (
+            f"effort compares {own.quantisation} and {other.quantisation} by their worst star at"
+            " any sub-pixel phase"
+        )
         reasons.append(f"{compared}, not by a field's rms")
     if other.sprite != own.sprite:
         coarse = other.sprite == "coarse"
@@ -250,7 +265,10 @@ def _nearest(rows: Sequence[CombinationRow]) -> CombinationRow:
 def _compared(own: CombinationRow, other: CombinationRow) -> str:
     faster = own.time_ms - other.time_ms
     noise = math.hypot(own.noise_ms, other.noise_ms)
-    return f"{words(other)} is {other.error_arcsec:.3g} arcsec off and {faster:.2g} ms faster (noise {noise:.2g} ms)"
+    return (
+        f"{words(other)} is {other.error_arcsec:.3g} arcsec off and {faster:.2g} ms faster (noise"
+        f" {noise:.2g} ms)"
+    )
 
 
 def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
@@ -366,7 +384,8 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     moving = (
         f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
     )
-    return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
+    stealing = " + bit stealing" if row.bit_stealing == "true" else ""
+    return f"{row.quantisation}{stealing}{moving}{shallow}"
 
 
 def draw_budget(
@@ -399,7 +418,8 @@ def draw_budget(
             key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf,
         )
         most.append(
-            f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}"
+            f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'}"
+            f" {scene}"
         )
     longest = max(stages, key=lambda one: one.time_ms)
     errors = f"Of auto's error most is {', '.join(most)}"
@@ -445,7 +465,8 @@ def run(
             measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
             if not measurement.star_count:
                 lines.append(
-                    f"{scene.name}: not measured: no star stands alone and stays in view over the exposure"
+                    f"{scene.name}: not measured: no star stands alone and stays in view over the"
+                    " exposure"
                 )
                 continue
             outcomes, parts_of_time = measurement.outcomes()
@@ -460,7 +481,8 @@ def run(
         shortened, glass = shortened_line(parts.own), glass_rows(file, scenes[DENSE], quick)
     if not rows:
         raise InputError(
-            f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag"
+            f"{file.path}: no star stands alone in view in any scene; write a larger [sky]"
+            " faintest_v_mag"
         )
     load = others.load()
     if load.busy:

@@ -190,7 +190,10 @@ def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
     own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
     for row in rows:
         if row is rows[0]:
-            yield f"the virtual tracker, {_words(row.size)}, {row.stars} stars, ms of the processor (median)"
+            yield (
+                f"the virtual tracker, {_words(row.size)}, {row.stars} stars, ms of the processor"
+                " (median)"
+            )
         beside = (
             ""
             if row.method == "hilstar"
@@ -201,7 +204,10 @@ def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
 
 
 def _notes(result: Result) -> Iterator[str]:
-    yield "whole frame: from attitude to codes in memory. turning: the same at 10 deg/s, with stars drawn along their paths"
+    yield (
+        "whole frame: from attitude to codes in memory. turning: the same at 10 deg/s, with stars"
+        " drawn along their paths"
+    )
     yield "linear only: the image alone, from given places and light"
     yield "stages are waited for, one after the other; gpu: the same by the driver's own timers"
     for name, does in result.does.items():
@@ -213,7 +219,10 @@ def _notes(result: Result) -> Iterator[str]:
         )
     for row in result.scenes:
         if row.random:
-            yield f"{_words(row.size)}, {row.stars} stars: {row.catalogue} from the catalogue, {row.random} random"
+            yield (
+                f"{_words(row.size)}, {row.stars} stars: {row.catalogue} from the catalogue,"
+                f" {row.random} random"
+            )
     for skipped in result.skipped:
         where = (
             ""

@@ -81,7 +81,10 @@ STEPS_A_STAR = 0.5
 # A star of so few pixels, lit by codes whose steps are several of the smallest.
 NARROW_STEPS = 0.6
 ROUNDING = 'quantisation = "round"'
-TOGETHER = "exact chooses the codes of a star's own pixels together, for what of its light is to be seen there"
+TOGETHER = (
+    "exact chooses the codes of a star's own pixels together, for what of its light is to be seen"
+    " there"
+)
 
 
 def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
@@ -204,10 +207,12 @@ def narrow_star() -> FailureCase:
     return FailureCase(
         "sigma 0.1 px",
         POINT_SAMPLED,
-        f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by {sampled.centroid_px:.2f} px"
-        f" ({wider_sampled.centroid_px:.4f} at sigma 0.5)",
-        f"flux off by {ours.flux:.1e}; centre of gravity by {ours.centroid_px:.2f} px ({wider.centroid_px:.4f} at sigma 0.5)",
-        "the Gaussian is integrated over pixels; pixels of any display keep that centroid error: write 0.5 px or more",
+        f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by"
+        f" {sampled.centroid_px:.2f} px ({wider_sampled.centroid_px:.4f} at sigma 0.5)",
+        f"flux off by {ours.flux:.1e}; centre of gravity by {ours.centroid_px:.2f} px"
+        f" ({wider.centroid_px:.4f} at sigma 0.5)",
+        "the Gaussian is integrated over pixels; pixels of any display keep that centroid error:"
+        " write 0.5 px or more",
         Figures(ours.flux, sampled.flux, FLUX_ERROR),
     )
 
@@ -376,7 +381,8 @@ def many_stars() -> FailureCase:
         f"{CROWD} stars in view",
         "image[rows, columns] += light",
         f"{100 * fault:.0f} % of the light lost: a repeated index is added once",
-        f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x {CORNER_PX}",
+        f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x"
+        f" {CORNER_PX}",
         "the GPU blends every sprite, in float32",
         Figures(max(error, pixel_error), fault, CROWD_ERROR),
     )
@@ -471,7 +477,8 @@ def popping_codes() -> FailureCase:
     fluxes = moving_code_fluxes("round"), moving_code_fluxes("exact")
     fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
     return FailureCase(
-        f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
+        f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma"
+        f" {SIGMA_PX:g} px",
         ROUNDING,
         f"its light varies by {fault:.3f} mag",
         f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
@@ -604,7 +611,8 @@ CODES: tuple[Callable[[], FailureCase], ...] = (
     lambda: judged(
         f"two stars 1 px apart, {FAINT_MAG:g} mag under white",
         neighbours((FAINT_MAG, FAINT_MAG), 1.0),
-        "a pixel is the star's that gives more than half of its light, and it is chosen for the light of both",
+        "a pixel is the star's that gives more than half of its light, and it is chosen for the"
+        " light of both",
     ),
     lambda: judged(
         f"codes of stars of sigma {NARROW_PX:g} px, {FAINT_MAG / 2:g} mag under white",
@@ -667,7 +675,8 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
     return FailureCase(
         case,
         "error diffusion (Floyd and Steinberg 1976)",
-        f"pixels beside it have up to {fault:.2g} of white too much: what is over white is handed on",
+        f"pixels beside it have up to {fault:.2g} of white too much: what is over white is"
+        " handed on",
         f"no pixel has more than {error:.1e} of white too much",
         "what is over white is lost, and told; no neighbour makes up for it",
         Figures(error, fault, float(np.diff(scene.panel.response.light).max()) * WHITE),

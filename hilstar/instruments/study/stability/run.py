@@ -72,8 +72,14 @@ def narrow_sigmas(directory: Path) -> None:
     sampled_columns = ("sampled_flux_error", "sampled_centroid_error_px", "sampled_peak_error")
     rows = np.column_stack([sigmas_px, errors]).tolist()
     write_csv(directory / "narrow_stars.csv", (*columns, *sampled_columns), rows)
-    note = "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a wide sampled star's pixels"
-    note += " cancel in its sums, here in float64 and without an end; hilstar draws in float32, and its sprites end."
+    note = (
+        "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a"
+        " wide sampled star's pixels"
+    )
+    note += (
+        " cancel in its sums, here in float64 and without an end; hilstar draws in float32, and its"
+        " sprites end."
+    )
     finding = narrow_finding(sigmas_px, ours, sampled)
     with chart(directory / "narrow_stars", finding, panels=3, note=note) as panels:
         for axes, points, integrated in zip(panels, np.abs(sampled), np.abs(ours), strict=True):
@@ -98,8 +104,9 @@ def narrow_finding(sigmas_px: FloatArray, ours: FloatArray, sampled: FloatArray)
     at = int(nearer.argmax())
     return (
         f"From sigma {sigmas_px[at]:.2f} px on a star sampled at pixel middles is placed nearer"
-        f" ({two_digits(sampled[1, at])} px, integrated {two_digits(ours[1, at])}), but its middle pixel is"
-        f" {100 * abs(sampled[2, at]):.0f} % too {'bright' if sampled[2, at] > 0 else 'faint'}"
+        f" ({two_digits(sampled[1, at])} px, integrated {two_digits(ours[1, at])}), but its middle"
+        f" pixel is {100 * abs(sampled[2, at]):.0f} % too"
+        f" {'bright' if sampled[2, at] > 0 else 'faint'}"
     )
 
 
@@ -109,10 +116,14 @@ def weak_perspectives(directory: Path) -> None:
     at_px, at_arcsec = (float(np.interp(10.0, angle_deg, off)) for off in (off_px, off_arcsec))
     half_px = float(np.interp(5.0, angle_deg, off_px))
     finding = (
-        f"Weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or {abs(at_arcsec):.0f} arcsec ten degrees"
-        f" from the axis, and by {abs(half_px / at_px):.2f} of that at five"
+        f"Weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or"
+        f" {abs(at_arcsec):.0f} arcsec ten degrees from the axis, and by {abs(half_px / at_px):.2f}"
+        " of that at five"
     )
-    note = "With the demo's lens and monitor. Perspective proper, as hilstar has it, has no such error."
+    note = (
+        "With the demo's lens and monitor. Perspective proper, as hilstar has it, has no such"
+        " error."
+    )
     with chart(directory / "weak_perspective", finding, panels=2, note=note) as (above, below):
         above.plot(angle_deg, np.abs(off_px), color=INK)
         below.plot(angle_deg, np.abs(off_arcsec), color=INK)
@@ -142,11 +153,17 @@ def ripples(directory: Path) -> None:
     )
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
     finding = (
-        f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with exact codes and by"
-        f" {spread['codes, round']:.3f} mag with rounded ones"
+        f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with"
+        f" exact codes and by {spread['codes, round']:.3f} mag with rounded ones"
     )
-    note = f"A star {image.CODES_MAG_UNDER_WHITE:g} mag under white, {image.CODES_BITS} bits, sigma {image.SIGMA_PX:g} px,"
-    note += f" {image.STEPS} steps; it moves in y by {image.PATH_PX[1] / image.PATH_PX[0]:.2f} of its way in x."
+    note = (
+        f"A star {image.CODES_MAG_UNDER_WHITE:g} mag under white, {image.CODES_BITS} bits, sigma"
+        f" {image.SIGMA_PX:g} px,"
+    )
+    note += (
+        f" {image.STEPS} steps; it moves in y by {image.PATH_PX[1] / image.PATH_PX[0]:.2f} of its"
+        " way in x."
+    )
     with chart(directory / "popping", finding, panels=2, note=note) as (above, below):
         for (name, mag), colour in zip(off_mag.items(), (GREEN, ORANGE, BLUE, INK), strict=True):
             above.plot(step_px, mag, color=colour, label=name, lw=1.0)
@@ -164,8 +181,8 @@ def turns(directory: Path) -> None:
     )
     largest = curves["with rates"].max()
     finding = (
-        "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady turn is followed"
-        f" within {two_digits(largest)} arcsec"
+        "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady"
+        f" turn is followed within {two_digits(largest)} arcsec"
     )
     with chart(directory / "turns", finding) as (axis,):
         for (name, error), colour in zip(curves.items(), (PURPLE, ORANGE, BLUE), strict=True):

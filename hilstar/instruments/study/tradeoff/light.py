@@ -155,7 +155,8 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
         Figure("median colour", "mag"),
         "made once, it serves every star of a catalogue, for any curves of the sensor",
         trials,
-        f"a bench asks for at most {len(load_catalog())} stars, each once: this time is spent when it is loaded",
+        f"a bench asks for at most {len(load_catalog())} stars, each once: this time is spent when"
+        " it is loaded",
     )
 
 
@@ -328,11 +329,12 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
         f"linear image of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}",
         Figure("flux error, worst", "mag", ROUNDING_MAG),
         Figure("centre of gravity, worst", "px"),
-        "methods this close change order from run to run; the default has the smallest footprint that cuts at most"
-        f" {MAX_CUT:g} of a star's light at any phase, and needs no table",
+        "methods this close change order from run to run; the default has the smallest footprint"
+        f" that cuts at most {MAX_CUT:g} of a star's light at any phase, and needs no table",
         trials,
-        f"sampling at pixel centres gives a wide star the right sum and the wrong shape: its middle pixel is"
-        f" {100 * excess:.0f} % too bright, and at sigma {SMALL_SIGMA_PX:g} px its flux is off by {worst:.2f} mag",
+        "sampling at pixel centres gives a wide star the right sum and the wrong shape: its middle"
+        f" pixel is {100 * excess:.0f} % too bright, and at sigma {SMALL_SIGMA_PX:g} px its flux is"
+        f" off by {worst:.2f} mag",
     )
 
 
@@ -401,7 +403,8 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
             f"flux error of a star {mag:g} mag under white, {bits} bits, worst", "mag", ROUNDING_MAG
         ),
         Figure("centroid error by a PSF fit, worst", "px"),
-        "it needs no more than one frame and leaves no pattern that a tracker could take for a star",
+        "it needs no more than one frame and leaves no pattern that a tracker could take for a"
+        " star",
         trials,
         f"by each centroider '{taken.method}' is off by at most: {by_each} px",
     )
@@ -453,5 +456,6 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
         Figure("sprites in the frame", "stars"),
         "Hipparcos is complete to about V = 7.5",
         trials,
-        "stars missing from Hipparcos are in no figure; it is complete to V = 7.3 to 9, by position and type (ESA SP-1200)",
+        "stars missing from Hipparcos are in no figure; it is complete to V = 7.3 to 9, by position"
+        " and type (ESA SP-1200)",
     )

@@ -124,7 +124,8 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
         f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion",
         Figure(f"stars missed in {len(turns)} fields", "stars", 0.1),
         Figure("tested but not in view, mean", "stars"),
-        "a smaller cell passes on fewer stars in a rich field, a larger one costs less in a sparse one",
+        "a smaller cell passes on fewer stars in a rich field, a larger one costs less in a"
+        " sparse one",
         trials,
     )
 
@@ -190,7 +191,8 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
         trials.append(Trial(name, *figures, work, road.dtype == SPRITE_DTYPE, road is EXACT))
     return Trials(
         "projection",
-        f"{len(near[0])} stars near the field to sprites, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
+        f"{len(near[0])} stars near the field to sprites, {camera.resolution_px[0]} x"
+        f" {camera.resolution_px[1]}",
         Figure("position error, worst star", "px", ROUNDING_PX),
         Figure("rms", "px"),
         "OpenGL 3.3 takes no float64, and the error of a float32 position grows with the monitor",
@@ -339,7 +341,8 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     paths_px = np.hypot(np.diff(x_px, axis=0), np.diff(y_px, axis=0))
     return Trials(
         "smear",
-        f"linear image of {len(many)} stars, paths of {paths_px.min():.0f} to {paths_px.max():.0f} px, {SIZE_PX} px squared",
+        f"linear image of {len(many)} stars, paths of {paths_px.min():.0f} to {paths_px.max():.0f}"
+        f" px, {SIZE_PX} px squared",
         Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE),
         Figure("centre of gravity, worst", "px"),
         "its error does not grow with the path, as that of a fixed number does",
@@ -423,7 +426,7 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
         Figure("rms", "arcsec"),
         "it needs nothing but the newest sample",
         trials,
-        f"a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken on each axis by {shaken};"
-        f" waiting for a sample makes the attitude {SAMPLE_MS} ms older;"
-        " the times of hold, of the linear predictors and of the blend include the timeline, those of the other two do not",
+        f"a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken on each axis by {shaken}; waiting"
+        f" for a sample makes the attitude {SAMPLE_MS} ms older; the times of hold, of the linear"
+        " predictors and of the blend include the timeline, those of the other two do not",
     )

@@ -84,7 +84,10 @@ def run(directory: Path, quick: bool = False) -> Judged:
         for row in step.trials
     ]
     write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), rows)
-    head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
+    head = (
+        f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast;"
+        " > hilstar's default"
+    )
     load = max((step.load for step in steps), key=lambda load: load.cores)
     return load.judged([head, *(line for step in steps for line in table_lines(step))])
 
@@ -149,7 +152,10 @@ def draw(path: Path, step: Trials, machine: str) -> None:
     front_words = (
         "" if step.load.busy else " Blue: the front, which nothing else is as right and as fast as."
     )
-    note = f"{capital(step.work)}.{front_words} Ring: hilstar's default. Bars: quartiles.{dotted} {machine}."
+    note = (
+        f"{capital(step.work)}.{front_words} Ring: hilstar's default. Bars: quartiles.{dotted}"
+        f" {machine}."
+    )
     height = max(4.2, 1.9 + 0.17 * len(step.trials))
     with chart(path, finding(step), note=step.load.note(note), height_inch=height) as (axes,):
         front = [shown[row.method] for row in step.trials if row.on_front]

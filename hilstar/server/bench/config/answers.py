@@ -164,7 +164,8 @@ def answers_place(settings: AnswersSettings) -> tuple[UdpPlace, AllowedSenders]:
     allowed = AllowedSenders(settings.allow)
     if not allowed and not place.loopback:
         raise InputError(
-            f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}"
+            f"{place} is open to other machines, and allow does not say which may send;"
+            f" {ALLOW_FORM}"
         )
     return place, allowed
 
@@ -200,7 +201,8 @@ def check_answers(settings: AnswersSettings) -> None:
     of_python = settings.format.startswith("python:")
     if settings.trust and not of_python:
         raise InputError(
-            f'trust is for format = "python:MODULE:FUNCTION"; remove it (format = "{shortened(settings.format)}")'
+            'trust is for format = "python:MODULE:FUNCTION"; remove it (format ='
+            f' "{shortened(settings.format)}")'
         )
     for package in settings.trust:
         if not package.isidentifier():
@@ -244,7 +246,10 @@ def _road_faults(settings: AnswersSettings) -> Faults:
     address = isinstance(settings.bind, str) and source == "zmq"
     yield (
         address,
-        f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint',
+        (
+            f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address'
+            " in endpoint"
+        ),
     )
     too_long = asked and len(bytes.fromhex(settings.poll_hex or "")) > MAX_POLL_BYTES
     yield too_long, f"poll_hex has over {MAX_POLL_BYTES} bytes; write what one question is"
@@ -261,7 +266,10 @@ def _format_faults(settings: AnswersSettings) -> Faults:
     known = form in {"packet", "json"} or re.fullmatch(r"python:[\w.]+:\w+", form)
     yield (
         not known,
-        f'format = "{shortened(form)}"; "packet", "json", "frame" or "python:MODULE:FUNCTION" is wanted',
+        (
+            f'format = "{shortened(form)}"; "packet", "json", "frame" or "python:MODULE:FUNCTION"'
+            " is wanted"
+        ),
     )
 
 
@@ -274,14 +282,20 @@ def _frame_faults(settings: AnswersSettings) -> Faults:
     without = (settings.sync_hex is None) == (framing == "sync")
     yield (
         without,
-        'framing = "sync" needs sync_hex, and no other has it; write sync_hex = "1A CF" or the like',
+        (
+            'framing = "sync" needs sync_hex, and no other has it; write sync_hex = "1A CF" or the'
+            " like"
+        ),
     )
     loose = framing == "fixed" and not isinstance(length, int)
     yield loose, 'framing = "fixed" needs length, in bytes; write length = 32 or the like'
     endless = framing == "sync" and length is None
     yield (
         endless,
-        'framing = "sync" needs length; write length = 32, or length = { at = 2, type = "u8", add = 0 }',
+        (
+            'framing = "sync" needs length; write length = 32, or length = { at = 2, type = "u8",'
+            " add = 0 }"
+        ),
     )
     if isinstance(length, FrameLength):
         odd = (field_format(length.type) or "f")[0] != "u"
@@ -297,7 +311,10 @@ def _frame_faults(settings: AnswersSettings) -> Faults:
     ordered = settings.convention.scalar == "last"
     yield (
         ordered,
-        'convention = { scalar = "last" }: fields says by the name qw which number is the scalar; remove it',
+        (
+            'convention = { scalar = "last" }: fields says by the name qw which number is the'
+            " scalar; remove it"
+        ),
     )
     some = 0 < sum(name in names for name in RATE) < len(RATE)
     yield some, "fields has one or two of wx, wy, wz; write all of them, or none"
@@ -317,6 +334,9 @@ def _frame_faults(settings: AnswersSettings) -> Faults:
         beyond = isinstance(length, int) and field.at + size > length
         yield (
             beyond,
-            f"{where} ends with byte {field.at + size - 1}, and length = {length}; mend one of them",
+            (
+                f"{where} ends with byte {field.at + size - 1}, and length = {length}; mend one of"
+                " them"
+            ),
         )
         yield field.scale == 0, f"{where} has scale = 0; write another number"

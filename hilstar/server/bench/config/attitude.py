@@ -130,17 +130,20 @@ def check_road(settings: AttitudeSettings) -> None:
         )
     if isinstance(settings.bind, str) and source != "udp":
         raise InputError(
-            f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint'
+            f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address'
+            " in endpoint"
         )
     if settings.allow and source != "udp" and not (source == "42" and settings.bind is True):
         raise InputError(
-            f'allow is for source = "udp", and for "42" with bind = true; remove it (source = "{source}")'
+            'allow is for source = "udp", and for "42" with bind = true; remove it (source ='
+            f' "{source}")'
         )
     if source == "serial" and (not settings.port or isinstance(settings.port, int)):
         raise InputError('source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
     if settings.convention != HILSTARS and source not in PACKET_SOURCES:
         raise InputError(
-            f'convention = {settings.convention}: source = "{source}" has a convention of its own; remove it'
+            f'convention = {settings.convention}: source = "{source}" has a convention of its own;'
+            " remove it"
         )
     if settings.spacecraft is not None and source not in {"vizard", "42"}:
         raise InputError(
@@ -158,11 +161,13 @@ def _check_simulation(settings: AttitudeSettings, name: str) -> None:
     for key in ("curve_secret_key", "curve_server_key", "allowed_clients"):
         if getattr(settings, key) is not None:
             raise InputError(
-                f'{key}: {name} knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"'
+                f"{key}: {name} knows no keys; remove it, and write endpoint ="
+                ' "tcp://127.0.0.1:PORT"'
             )
     if settings.clock != "estimated":
         raise InputError(
-            f'clock = "{settings.clock}": {name} sends the time of its simulation; write clock = "estimated"'
+            f'clock = "{settings.clock}": {name} sends the time of its simulation; write clock ='
+            ' "estimated"'
         )
 
 
@@ -177,11 +182,13 @@ def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
         for key in ("endpoint", "bind", "port"):
             if getattr(settings, key) not in {None, ""}:
                 raise InputError(
-                    f'{key}: source = "scpi" has none; remove it, and give the address in --scpi HOST:PORT'
+                    f'{key}: source = "scpi" has none; remove it, and give the address in --scpi'
+                    " HOST:PORT"
                 )
         if settings.clock != "estimated":
             raise InputError(
-                f'clock = "{settings.clock}": SCPI\'s attitudes are stamped by this machine; remove it'
+                f'clock = "{settings.clock}": SCPI\'s attitudes are stamped by this machine;'
+                " remove it"
             )
         return bound_place("127.0.0.1:0", "", None), AllowedSenders(())
     place, allowed = (
@@ -190,7 +197,8 @@ def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
     )
     if not allowed and not place.loopback:
         raise InputError(
-            f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}"
+            f"{place} is open to other machines, and allow does not say which may send;"
+            f" {ALLOW_FORM}"
         )
     return place, allowed
 
@@ -200,7 +208,8 @@ def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
     place, allowed = parse_endpoint(settings.address), AllowedSenders(settings.allow)
     if settings.bind is True and not allowed and not place.loopback:
         raise InputError(
-            f"{settings.address} is open to other machines, and allow does not say which may send; {ALLOW_FORM}"
+            f"{settings.address} is open to other machines, and allow does not say which may send;"
+            f" {ALLOW_FORM}"
         )
     # links and packets take 12 ms, which no other source needs here
     from hilstar.attitude.wire.nasa42 import spacecraft_number

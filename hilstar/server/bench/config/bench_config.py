@@ -89,8 +89,8 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
         return 0
     if config.sky.epoch_utc == FROM_SOURCE:
         raise InputError(
-            f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log, attitude LOG);'
-            " write the UTC of t_ns = 0"
+            f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log,'
+            " attitude LOG); write the UTC of t_ns = 0"
         )
     # importing ERFA takes 30 ms, which only a date needs
     from hilstar.attitude.logs.earth import utc_ns_of
@@ -149,8 +149,8 @@ def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchCo
         return config
     if scale not in SCALES:
         raise InputError(
-            f'{EPOCH_KEY} "{FROM_SOURCE}": the times of this log are no dates in {", ".join(SCALES[:-1])} or {SCALES[-1]};'
-            " write the UTC of t_ns = 0"
+            f'{EPOCH_KEY} "{FROM_SOURCE}": the times of this log are no dates in'
+            f" {', '.join(SCALES[:-1])} or {SCALES[-1]}; write the UTC of t_ns = 0"
         )
     if scale == "UTC":
         return _on_day(config, UNIX, first_ns)
@@ -218,7 +218,8 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
     """
     if HEADS in tables:
         raise InputError(
-            f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files"
+            f"{path}: names several heads, and one bench file is wanted here; give one of its"
+            " heads' files"
         )
     try:
         _check_finite(tables)
@@ -279,8 +280,8 @@ def _check_meaning(config: BenchConfig) -> None:
     ):
         if width * height > MAX_AREA_PX:
             raise InputError(
-                f"[{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million pixels; write"
-                f" {MAX_AREA_PX / 1e6:.0f} million at most, such as [8192, 8192]"
+                f"[{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million"
+                f" pixels; write {MAX_AREA_PX / 1e6:.0f} million at most, such as [8192, 8192]"
             )
     render, faults = config.render, config.faults
     if render.flux_at_white_e_per_s is not None and render.brightest_v_mag is not None:
@@ -295,7 +296,8 @@ def _check_meaning(config: BenchConfig) -> None:
         )
     if faults.endpoint is not None and faults.endpoint == config.attitude.address:
         raise InputError(
-            f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another port"
+            f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another"
+            " port"
         )
     hardware.check_channels(config.tracker)
     hardware.check_primaries(config.monitor.primaries)
@@ -313,11 +315,13 @@ def _check_colour(config: BenchConfig) -> None:
     render = config.render
     if render.bit_stealing and render.colour not in (None, "depth"):
         raise InputError(
-            f'[render] colour = "{render.colour}" and bit_stealing: the codes of r, g and b serve one; write one of them'
+            f'[render] colour = "{render.colour}" and bit_stealing: the codes of r, g and b serve'
+            " one; write one of them"
         )
     if render.colour == "star" and not config.monitor.primaries.known:
         raise InputError(
-            '[render] colour = "star" needs the light of the primaries; write [monitor.primaries] file, or xy_r to _b'
+            '[render] colour = "star" needs the light of the primaries; write [monitor.primaries]'
+            " file, or xy_r to _b"
         )
 
 
@@ -356,7 +360,8 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
         raise InputError("[sky] has epoch_utc and epoch_jyear; write one of them")
     if sky.bodies.satellite_magnitudes is not None and sky.bodies.satellites is None:
         raise InputError(
-            '[sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too'
+            "[sky.bodies] satellite_magnitudes is of no satellites; write satellites ="
+            ' "tles.txt" too'
         )
     for needs, what in (
         (background.zodiacal is not None, "[background] zodiacal needs"),
@@ -368,8 +373,8 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
             raise InputError(f'{what} a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
     if has_observer(config) and any(sky.observer_velocity_km_s):
         raise InputError(
-            "[sky] observer_velocity_km_s: with [sky.bodies], [spacecraft] or [site] the velocity follows from the ephemeris;"
-            " leave it out"
+            "[sky] observer_velocity_km_s: with [sky.bodies], [spacecraft] or [site] the velocity"
+            " follows from the ephemeris; leave it out"
         )
     _check_site(config)
     _check_orbit(config)
@@ -381,12 +386,13 @@ def _check_site(config: BenchConfig) -> None:
     if config.spacecraft.orbit is not None or config.sky.bodies.earth:
         other = "[sky.bodies] earth" if config.spacecraft.orbit is None else "[spacecraft] orbit"
         raise InputError(
-            f"[site] is a place on the ground, and {other} is seen from above it; leave one of them out"
+            f"[site] is a place on the ground, and {other} is seen from above it; leave one of"
+            " them out"
         )
     if config.attitude.source == "vizard" and config.attitude.use_velocity:
         raise InputError(
-            '[site] is a place on the ground, and [attitude] source = "vizard" sends a spacecraft\'s velocity; write'
-            " use_velocity = false"
+            '[site] is a place on the ground, and [attitude] source = "vizard" sends a'
+            " spacecraft's velocity; write use_velocity = false"
         )
 
 
@@ -394,18 +400,20 @@ def _check_orbit(config: BenchConfig) -> None:
     attitude, orbit = config.attitude, config.spacecraft.orbit
     if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
         raise InputError(
-            "[sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit = the path of a TLE or an"
+            "[sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit"
+            " = the path of a TLE or an"
             f' OEM, or "{SOURCE}"'
         )
     if orbit == SOURCE and attitude.source != "vizard":
         raise InputError(
-            f'[spacecraft] orbit = "{SOURCE}": of the sources of attitudes only "vizard" (Basilisk) sends the spacecraft\'s'
-            f' place, and [attitude] source = "{attitude.source}"; write the path of a TLE or an OEM'
+            f'[spacecraft] orbit = "{SOURCE}": of the sources of attitudes only "vizard" (Basilisk)'
+            f' sends the spacecraft\'s place, and [attitude] source = "{attitude.source}"; write'
+            " the path of a TLE or an OEM"
         )
     if orbit == SOURCE and not attitude.use_velocity:
         raise InputError(
-            f'[attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the source\'s place and velocity;'
-            " leave use_velocity out"
+            f'[attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the'
+            " source's place and velocity; leave use_velocity out"
         )
     if (
         orbit not in {None, GEOCENTRE, SOURCE}
@@ -413,6 +421,6 @@ def _check_orbit(config: BenchConfig) -> None:
         and attitude.use_velocity
     ):
         raise InputError(
-            "[attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write use_velocity = false,"
-            ' or orbit = "geocentre"'
+            "[attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft]"
+            ' orbit; write use_velocity = false, or orbit = "geocentre"'
         )

@@ -40,8 +40,14 @@ LAYOUTS: dict[str, tuple[tuple[float, float], ...]] = {
     "bgr-stripe": ((THIRD, 0.0), (0.0, 0.0), (-THIRD, 0.0)),
     "vertical": ((0.0, -THIRD), (0.0, 0.0), (0.0, THIRD)),
 }
-WHITE_TOO = "its white has a subpixel of its own, so red, green and blue do not add up; take a panel of three primaries"
-SHARED = "its pixels share subpixels, so a pixel's light depends on its neighbours' codes; take a panel whose pixels have all three"
+WHITE_TOO = (
+    "its white has a subpixel of its own, so red, green and blue do not add up; take a panel of"
+    " three primaries"
+)
+SHARED = (
+    "its pixels share subpixels, so a pixel's light depends on its neighbours' codes; take a panel"
+    " whose pixels have all three"
+)
 REFUSED_LAYOUTS = dict.fromkeys(("rgbw", "wrgb", "rgwb", "woled"), WHITE_TOO)
 REFUSED_LAYOUTS |= dict.fromkeys(("pentile", "rgbg", "diamond", "delta"), SHARED)
 Chromaticity = Annotated[
@@ -145,13 +151,15 @@ def check_channels(tracker: Tracker) -> None:
     missing = [key for key in (f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb") if key not in given]
     if QUANTUM_EFFICIENCY in given and len(given) > 1:
         raise InputError(
-            f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or _r, _g and _b"
+            f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or"
+            " _r, _g and _b"
         )
     if tracker.detector.bayer is not None and QUANTUM_EFFICIENCY in given:
         three = ", ".join(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb")
         raise InputError(
-            f'[tracker.detector] bayer = "{tracker.detector.bayer}" has three colours of pixels, and [tracker] one'
-            f" {QUANTUM_EFFICIENCY}; write {three} in its place, or leave bayer out"
+            f'[tracker.detector] bayer = "{tracker.detector.bayer}" has three colours of pixels,'
+            f" and [tracker] one {QUANTUM_EFFICIENCY}; write {three} in its place, or leave"
+            " bayer out"
         )
     if missing and QUANTUM_EFFICIENCY not in given:
         key = missing[0] if given else QUANTUM_EFFICIENCY
@@ -209,13 +217,15 @@ def check_primaries(primaries: PrimariesSettings) -> None:
         )
     if primaries.layout in REFUSED_LAYOUTS:
         raise InputError(
-            f'[monitor.primaries] layout = "{primaries.layout}": {REFUSED_LAYOUTS[primaries.layout]}'
+            f'[monitor.primaries] layout = "{primaries.layout}":'
+            f" {REFUSED_LAYOUTS[primaries.layout]}"
         )
     if primaries.layout not in LAYOUTS:
         names = ", ".join(f'"{name}"' for name in LAYOUTS)
         meant = did_you_mean(primaries.layout, tuple(LAYOUTS))
         raise InputError(
-            f"[monitor.primaries] layout = {shortened(json.dumps(primaries.layout))}: {meant}write {names}, or offsets_px"
+            f"[monitor.primaries] layout = {shortened(json.dumps(primaries.layout))}: {meant}write"
+            f" {names}, or offsets_px"
         )
     if primaries.offsets_px is not None and primaries.layout != "white":
         raise InputError("[monitor.primaries] has layout and offsets_px; write one of them")
@@ -317,7 +327,8 @@ def check_sync(
     if tracker.frame_hz is not None and tracker.frame_hz * tracker.exposure_s > 1 + ROUNDING:
         most = f"{1 / tracker.exposure_s:.6g} or less"
         raise InputError(
-            f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s overlap; write {most}"
+            f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s"
+            f" overlap; write {most}"
         )
     if sync.port is None:
         return
@@ -325,7 +336,10 @@ def check_sync(
         "://" in sync.port
         and not re.fullmatch(NETWORK_PORT + r"[^/?]+:\d{1,5}([/?].*)?", sync.port)
     ):
-        advice = f'write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"; leave it out for no pulse'
+        advice = (
+            f'write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"; leave it out for no'
+            " pulse"
+        )
         raise InputError(f"[sync] port = {sync.port!r}: {advice}")
     between_ms = sync.every_frames * monitor.period_ms
     if sync.pulse_ms >= between_ms:

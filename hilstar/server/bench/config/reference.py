@@ -142,7 +142,10 @@ def row(field: FieldInfo, hint: Any, told: str) -> str:
     meaning, _, default = told.partition(" Default: ")
     if field.default is NODEFAULT:
         default = "**required**"
-    return f"| `{field.name}` | {value_text(field.name, hint)} | {default or f'`{toml(field.default)}`'} | {meaning} |"
+    return (
+        f"| `{field.name}` | {value_text(field.name, hint)} |"
+        f" {default or f'`{toml(field.default)}`'} | {meaning} |"
+    )
 
 
 def notes_of(hint: Any) -> list[Meta]:

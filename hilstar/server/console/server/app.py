@@ -56,8 +56,8 @@ HEADERS = {
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
 }
 POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'{sockets}; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:;"
+    " connect-src 'self'{sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 
 
@@ -93,7 +93,8 @@ class Guard:
         if host not in self._names and not self._is_own(host):
             raise Refused(
                 421,
-                "this page is not served under that name; open it as hilstar printed it, or give --console-name",
+                "this page is not served under that name; open it as hilstar printed it, or give"
+                " --console-name",
             )
 
     def _is_own(self, host: str) -> bool:
@@ -139,7 +140,8 @@ class Guard:
         if True not in matches:
             raise Refused(
                 401,
-                "the token is missing or wrong: open the address that hilstar printed, or send Authorization: Bearer",
+                "the token is missing or wrong: open the address that hilstar printed, or send"
+                " Authorization: Bearer",
             )
 
 

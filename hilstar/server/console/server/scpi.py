@@ -374,7 +374,8 @@ class Connection:
             if not self.unlocked and unit.pattern not in UNLOCKED:
                 raise ScpiError(
                     -203,
-                    'write SYST:AUTH "TOKEN" first, with the token that hilstar printed or was given',
+                    'write SYST:AUTH "TOKEN" first, with the token that hilstar printed or was'
+                    " given",
                 )
             if unit.pattern not in UNLOCKED:
                 self._acts()
@@ -462,7 +463,8 @@ class Connection:
         if self._server.sky is None:
             raise ScpiError(
                 -221,
-                f"the attitude comes by {self._server.setup.source}; write [attitude] source = 'scpi'",
+                f"the attitude comes by {self._server.setup.source}; write [attitude] source ="
+                " 'scpi'",
             )
         return self._server.sky
 

@@ -400,7 +400,10 @@ def test_xml_that_is_written_states_all_that_it_means_and_holds_the_numbers(tmp_
     for segment, times in zip(root[1], BLOCKS_NS, strict=True):
         metadata, data = segment
         meta = {child.tag: child.text for child in metadata if child.tag != "COMMENT"}
-        order = "OBJECT_NAME OBJECT_ID REF_FRAME_A REF_FRAME_B ATTITUDE_DIR TIME_SYSTEM START_TIME STOP_TIME ATTITUDE_TYPE"
+        order = (
+            "OBJECT_NAME OBJECT_ID REF_FRAME_A REF_FRAME_B ATTITUDE_DIR TIME_SYSTEM START_TIME"
+            " STOP_TIME ATTITUDE_TYPE"
+        )
         assert list(meta) == [*order.split(), "QUATERNION_TYPE"]
         assert {key: meta[key] for key in STATED} == STATED
         assert [state.findtext("quaternionDerivative/EPOCH") for state in data] == list(

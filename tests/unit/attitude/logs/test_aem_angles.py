@@ -255,7 +255,9 @@ XML_CASES = [
         "321",
         "eulerAngleRate",
         (*ANGLES, 1.0, 2.0, 3.0),
-        f"<rotationAngles>{turns('angle', 'ZYX')}</rotationAngles><rotationRates>{turns('rate', 'ZYX')}</rotationRates>",
+        (
+            f"<rotationAngles>{turns('angle', 'ZYX')}</rotationAngles><rotationRates>{turns('rate', 'ZYX')}</rotationRates>"
+        ),
     ),
     ("1.0", "SPIN", None, "spin", SPIN_VALUES, flat(SPIN_NAMES, SPIN_VALUES)),
     (

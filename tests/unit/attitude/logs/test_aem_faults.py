@@ -428,7 +428,10 @@ def _n(text, count):
         ),
         ('<!DOCTYPE aem SYSTEM "file:///etc/passwd"><aem/>', "has a DOCTYPE"),
         (
-            '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><aem>&b;</aem>',
+            (
+                '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b'
+                ' "&a;&a;">]><aem>&b;</aem>'
+            ),
             "has a DOCTYPE",
         ),
         (f"{HEAD}&b;</aem>", "not well-formed XML (undefined entity)"),
@@ -513,7 +516,10 @@ def test_a_keyword_of_the_other_version_is_refused_with_both_named(
     meta = "".join(
         f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :])
     )
-    document = f'<aem id="CCSDS_AEM_VERS" version="{version}"><body><segment><metadata>{meta}</metadata></segment></body></aem>'
+    document = (
+        '<aem id="CCSDS_AEM_VERS"'
+        f' version="{version}"><body><segment><metadata>{meta}</metadata></segment></body></aem>'
+    )
     assert words in refusal(tmp_path, document)
 
 
@@ -522,7 +528,8 @@ def test_an_element_that_would_be_passed_over_is_refused_with_its_line(tmp_path,
     number = next(k for k, line in enumerate(lines, start=1) if "<QUATERNION_TYPE>" in line)
     message = refusal(tmp_path, xml.replace("QUATERNION_TYPE>", "QUATERNION_TYP>"))
     assert message.startswith(
-        f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is not a keyword of an AEM's metadata; did you mean"
+        f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is not a keyword of an AEM's metadata; did"
+        " you mean"
     )
 
 

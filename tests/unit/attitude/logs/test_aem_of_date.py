@@ -147,7 +147,7 @@ def test_what_tells_no_utc_or_lies_beyond_the_table_is_said(tmp_path):
     assert "earth-orientation" in [kind for kind, _ in log.told]
     lines = log.conventions.lines(Mounting())
     assert (
-        "turns components of ITRF into those of SC_BODY_1 (ITRF by hilstar: the ICRF, at each epoch)"
-        in lines[0]
+        "turns components of ITRF into those of SC_BODY_1 (ITRF by hilstar: the ICRF, at each"
+        " epoch)" in lines[0]
     )
     assert " at 2050-01-01T00:00:00 Alnilam" in lines[-1]

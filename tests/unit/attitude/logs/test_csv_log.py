@@ -115,7 +115,8 @@ def test_rows_that_the_log_marks_as_not_valid_are_left_out_and_said(log, header,
 
 def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(log):
     text = "".join(
-        f'{{"t_ns": {k}, "q": [{LOST if k == 1 else Q}], "valid": {"false" if k == 1 else "true"}}}\n'
+        f'{{"t_ns": {k}, "q": [{LOST if k == 1 else Q}], "valid":'
+        f" {'false' if k == 1 else 'true'}}}\n"
         for k in range(3)
     )
     found = open_log(log(text))
@@ -170,18 +171,28 @@ REFUSED = {
     f"t_s,qw,qx,qy,qz,rx,ry,rz,rx\n0,{Q},1,2,3,4\n": ":1: column rx is there twice",
     f'{{"t_ns":1,"q":[{Q}],"q":[{OTHER}]}}\n': ':1: key "q" is there twice',
     f'{{"t_ns":1,"t_ns":2,"q":[{Q}]}}\n': ':1: key "t_ns" is there twice',
-    f'[{{"t_ns": 1, "q": [{Q}]}},{{"t_ns": 2, "q": [{Q}]}}]': "is a JSON array, or an object over several lines; write",
+    f'[{{"t_ns": 1, "q": [{Q}]}},{{"t_ns": 2, "q": [{Q}]}}]': (
+        "is a JSON array, or an object over several lines; write"
+    ),
     f'[\n {{"t_ns": 1,\n "q": [{Q}]}}\n]\n': "is a JSON array, or an object over several lines",
-    f'{{\n "t_ns": 1,\n "q": [{Q}]\n}}\n': ":1: a JSON object over several lines; write each on one line",
-    HEAD
-    + f"1763800000000,{Q}\n": ":2: t_s = 1763800000000 s does not fit 64 bits of ns; t_s is in seconds; name",
-    HEAD
-    + f"100.01,{Q}\n100.01,{Q}\n": ":3: time does not increase (t_ns 100010000000 after 100010000000): two attitudes have one",
+    f'{{\n "t_ns": 1,\n "q": [{Q}]\n}}\n': (
+        ":1: a JSON object over several lines; write each on one line"
+    ),
+    HEAD + f"1763800000000,{Q}\n": (
+        ":2: t_s = 1763800000000 s does not fit 64 bits of ns; t_s is in seconds; name"
+    ),
+    HEAD + f"100.01,{Q}\n100.01,{Q}\n": (
+        ":3: time does not increase (t_ns 100010000000 after 100010000000): two attitudes have one"
+    ),
     HEAD + f"2,{Q}\n1,{Q}\n": "; sort the log by time",
     f"t,qw,qx,qy,qz\n0,{Q}\n": ":1: column t has no unit; write t_s, or its unit as t [s]",
-    f"0,{Q}\n1,{Q}\n": ":1: column t_s is missing, as no line names the columns; the header must have t_s,qw,qx,qy,qz",
-    HEAD
-    + "0,0,7,0,7,0,0\n": ":2: 7 cells and 5 columns (a decimal comma, or commas between thousands?",
+    f"0,{Q}\n1,{Q}\n": (
+        ":1: column t_s is missing, as no line names the columns; the header must have"
+        " t_s,qw,qx,qy,qz"
+    ),
+    HEAD + "0,0,7,0,7,0,0\n": (
+        ":2: 7 cells and 5 columns (a decimal comma, or commas between thousands?"
+    ),
     HEAD + f"0,{Q},5\n": ":2: 6 cells and 5 columns",
     f"t_s,qw,qx,qy,qz,valid\n0,{Q},maybe\n": ":2: valid = 'maybe'; write 1 or 0",
     "t_s;qw;qx;qy;qz\n0;1;0;0;0\n"

@@ -95,7 +95,10 @@ def test_a_gap_of_a_log_without_rates_is_held_and_told():
     assert joins.told == [
         (
             "log-gap",
-            "the log has 1 gap, the longest 20.5 s (over 5 times its usual 0.5 s); the attitude is held there",
+            (
+                "the log has 1 gap, the longest 20.5 s (over 5 times its usual 0.5 s); the attitude"
+                " is held there"
+            ),
         ),
     ]
     timeline = log_timeline(samples, STREAM)

@@ -207,7 +207,7 @@ def test_the_first_whole_frame_after_garbage_and_a_delimiter_is_taken(sanitized,
         frame(TimeRequest(1, 1))[:-1],
         rng.bytes(3000),
     ):
-        (_, answer) = driven(sanitized, ["i", f"p {(garbage + DELIMITER + good).hex()}"])
+        _, answer = driven(sanitized, ["i", f"p {(garbage + DELIMITER + good).hex()}"])
         assert pushed(answer)[0][-1] == (2, cobs.decode(good[:-1]).hex())
 
 
@@ -232,7 +232,7 @@ def test_a_line_that_never_brings_a_delimiter_costs_one_refusal(sanitized):
 def test_what_was_cut_in_two_before_the_first_delimiter_is_no_refusal(sanitized):
     whole = frame(TimeRequest(3, 4))
     for first, packets in ((whole[5:], 1), (whole, 2), (b"\x55" * 999 + DELIMITER, 1)):
-        (_, answer) = driven(sanitized, ["i", f"p {(first + whole).hex()}"])
+        _, answer = driven(sanitized, ["i", f"p {(first + whole).hex()}"])
         assert pushed(answer)[1] == []
         assert pushed(answer)[2] == [packets, 0, 0]
 

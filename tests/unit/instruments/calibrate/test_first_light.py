@@ -112,8 +112,8 @@ def test_a_key_says_where_the_squares_of_its_way_round_are(key):
     )
     words = look_of(way)
     assert (
-        f"largest square {'top' if corner[1] < 0 else 'bottom'} {'left' if corner[0] < 0 else 'right'},"
-        in words
+        f"largest square {'top' if corner[1] < 0 else 'bottom'}"
+        f" {'left' if corner[0] < 0 else 'right'}," in words
     )
     sides = {
         (2, 0): "to its right",
@@ -216,7 +216,10 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
     ("command", "words"),
     [
         (
-            f"{sys.executable} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}} {{output}}",
+            (
+                f"{sys.executable} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}}"
+                " {output}"
+            ),
             "no camera on bus 3",
         ),
         ("true {pattern} {output}", "wrote no image"),
@@ -358,7 +361,10 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
     )
     monkeypatch.setattr(sessions, "RUNS", {"frames": frames})
     monkeypatch.setattr(sessions, "NAMES", ("frames",))
-    grab = f"sh -c 'cp {{pattern}} {{output}}; case {{output}} in *frame_2*) test -e {tmp_path / 'mended'};; esac'"
+    grab = (
+        "sh -c 'cp {pattern} {output}; case {output} in *frame_2*) test -e"
+        f" {tmp_path / 'mended'};; esac'"
+    )
 
     def go(*again):
         taken.clear()

@@ -303,10 +303,16 @@ def test_symbols_and_units_of_a_sheet_are_read_as_people_spell_them(tmp_path, ro
 
 
 TWO_VALUES = {
-    "K,0.25,DN/e-\nK,0.5,DN/e-\nsigma_d,2.5,e-": ":3: K makes gain_e_per_dn 2, and line 2 has K for 4; leave one of them",
+    "K,0.25,DN/e-\nK,0.5,DN/e-\nsigma_d,2.5,e-": (
+        ":3: K makes gain_e_per_dn 2, and line 2 has K for 4; leave one of them"
+    ),
     "K,0.25,DN/e-\n1/K,5,e-/DN": ":3: 1/K makes gain_e_per_dn 5, and line 2 has K for 4",
-    "K,0.25,DN/e-\nsigma_d,2.5,e-\nσ_d,2.6,e⁻": ":4: σ_d makes read_noise_e 2.6, and line 3 has sigma_d for 2.5",
-    "sigma_d,1.2,DN\nsigma_d,2.5,e-\nK,0.25,DN/e-": ":2: sigma_d makes read_noise_e 4.8, and line 3 has sigma_d for 2.5",
+    "K,0.25,DN/e-\nsigma_d,2.5,e-\nσ_d,2.6,e⁻": (
+        ":4: σ_d makes read_noise_e 2.6, and line 3 has sigma_d for 2.5"
+    ),
+    "sigma_d,1.2,DN\nsigma_d,2.5,e-\nK,0.25,DN/e-": (
+        ":2: sigma_d makes read_noise_e 4.8, and line 3 has sigma_d for 2.5"
+    ),
 }
 
 

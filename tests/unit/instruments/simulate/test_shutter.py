@@ -229,7 +229,10 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
         ),
         (
             {"row_shift_us": 2.0},
-            'row_shift_us = 2 with shutter = "global"; write row_shift_us = 0, or shutter = "frame-transfer"',
+            (
+                'row_shift_us = 2 with shutter = "global"; write row_shift_us = 0, or shutter ='
+                ' "frame-transfer"'
+            ),
         ),
         ({"shutter": "curtain"}, "shutter"),
         ({"shutter": "rolling", "row_time_us": 1e4}, "shorten row_time_us or turn more slowly"),

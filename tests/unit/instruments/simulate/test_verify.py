@@ -142,8 +142,9 @@ def test_a_bench_whose_geometry_is_as_assumed_has_its_own_camera(tmp_path):
 def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
     """Distortion, a tilted screen and a misalignment, each of them known."""
     (tmp_path / "geometry.toml").write_text(
-        'kind = "hilstar geometry 1"\nresolution_px = [480, 400]\nfocal_length_px = 2081.5\nprincipal_point_px = [241, 198.5]\n'
-        "q_cam_to_mon = [0.99999, 0, 0, 0.00447]\nk1 = 0.6\np1 = 0.001\ntilt_deg = [0.8, -0.5]\n"
+        'kind = "hilstar geometry 1"\nresolution_px = [480, 400]\nfocal_length_px ='
+        " 2081.5\nprincipal_point_px = [241, 198.5]\nq_cam_to_mon = [0.99999, 0, 0, 0.00447]\nk1 ="
+        " 0.6\np1 = 0.001\ntilt_deg = [0.8, -0.5]\n"
     )
     path = bench_file(tmp_path)
     path.write_text(
@@ -176,7 +177,10 @@ def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(
         for code, value in enumerate(light)
     ]
     (tmp_path / "monitor.csv").write_text("\n".join([f"code,{columns}", *rows]))
-    head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse = "monitor.csv"\n'
+    head = (
+        'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse'
+        ' = "monitor.csv"\n'
+    )
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
     path = bench_file(
         tmp_path, "centroid_px = 1e-4\n", bits=8, method="round", calibration="monitor.toml"
@@ -197,7 +201,10 @@ def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp
     light = gamma_response(8).light
     rows = [f"{code},{float(value) + 1e-9!r}" for code, value in enumerate(light)]
     (tmp_path / "monitor.csv").write_text("\n".join(["code,w", *rows]))
-    head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse = "monitor.csv"\n'
+    head = (
+        'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse'
+        ' = "monitor.csv"\n'
+    )
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
     lines = 'centroid_px = 1e-4\ntrue_calibration = "monitor.toml"\n'
     path = bench_file(tmp_path, lines, bits=8, method="round", calibration="gamma2.2")

@@ -16,7 +16,10 @@ from tests.support.commands import run_hilstar_here
 
 BENCH = (ROOT / "examples" / "bench.toml").read_text()
 SHIPPED = sorted([*(ROOT / "configs").glob("*.toml"), *(ROOT / "examples").glob("*bench.toml")])
-STAR = "star 1.0 px sigma, of the sky 0.55; brightest pixel 1.1 mag fainter; 13.6 px share it, of the sky 4.5"
+STAR = (
+    "star 1.0 px sigma, of the sky 0.55; brightest pixel 1.1 mag fainter; 13.6 px share it, of the"
+    " sky 4.5"
+)
 LINE = "screen 18.0 x 10.2 deg, tracker 10.9 deg, 0.89 tracker px a monitor px"
 FIGURE_DEG = 1e-9  # of angles that are one arctangent each
 

@@ -255,8 +255,8 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
     )
     (tmp_path / "u.csv").write_text("0.8,1.0\n1.0,0.9\n")
     (tmp_path / "c.toml").write_text(
-        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 10\nresponse = "r.csv"\n'
-        '[uniformity]\nfile = "u.csv"\n'
+        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits'
+        ' = 10\nresponse = "r.csv"\n[uniformity]\nfile = "u.csv"\n'
     )
     (tmp_path / "geometry.toml").write_text((folder / "geometry.toml").read_text())
     text = (

@@ -198,8 +198,8 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
     )
     assert done.returncode == 0, done.stderr
     assert (
-        "satellites: 60 of 61 have a place by their elements; 60 are in [sky.bodies] satellite_magnitudes"
-        in done.stderr
+        "satellites: 60 of 61 have a place by their elements; 60 are in [sky.bodies]"
+        " satellite_magnitudes" in done.stderr
     )
     assert done.stderr.count("OLD") == 1
     assert name in (bench_file.parent / "t.csv").read_text()

@@ -128,7 +128,10 @@ def test_each_command_states_the_star_and_warns_once(tmp_path):
     # as wide, and quicker
     few = {"tracker": {"resolution_px": [512, 512]}, "monitor": {"resolution_px": [640, 480]}}
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, WIDE, few))
-    line = "star 4.0 px sigma, of the sky 0.55; brightest pixel 3.9 mag fainter; 199.2 px share it, of the sky 4.5"
+    line = (
+        "star 4.0 px sigma, of the sky 0.55; brightest pixel 3.9 mag fainter; 199.2 px share it, of"
+        " the sky 4.5"
+    )
     drawn = ("frame", "bench.toml", "--radec", "84.057,-1.2,0", "-o", "o.fits")
     for words in (drawn, ("doctor", "bench.toml"), ("budget", "bench.toml")):
         told = run_hilstar_here(*words, cwd=tmp_path)

@@ -84,7 +84,10 @@ def test_satellites_are_where_sgp4_has_them_at_that_utc(tmp_path, rng):
     path.write_text(
         bench_text(
             MOON
-            | {"sky.bodies": {"satellites": "tles.txt"}, "spacecraft": {"orbit": "station.tle"}}
+            | {
+                "sky.bodies": {"satellites": "tles.txt"},
+                "spacecraft": {"orbit": "station.tle"},
+            }
         )
     )
     now = utc_ns("2008-09-20T12:30:00")

@@ -80,8 +80,15 @@ def test_the_documentation_names_every_field():
 def test_a_message_has_only_what_it_says_and_no_number_that_json_lacks():
     point = PageText(point=ChartPoint(t_s=1.5, age_ms=float("nan"), frame_ms=float("inf")))
     assert json.loads(point.json()) == {
-        "point": dict.fromkeys(names_of(ChartPoint))
-        | {"t_s": 1.5, "missed": 0, "refused": 0, "wrong": 0},
+        "point": (
+            dict.fromkeys(names_of(ChartPoint))
+            | {
+                "t_s": 1.5,
+                "missed": 0,
+                "refused": 0,
+                "wrong": 0,
+            }
+        ),
     }
     truth = PageText(truth=Truth(frame=3, stars=[StarMark(1.0, 2.0, None, 26311, "\u03b5 Ori", 1)]))
     assert json.loads(truth.json()) == {

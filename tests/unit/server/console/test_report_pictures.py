@@ -72,7 +72,8 @@ def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
 def test_pictures_have_the_faults_that_the_run_had(tmp_path):
     (tmp_path / "bench.toml").write_text(SMALL_BENCH)
     (tmp_path / "faults.toml").write_text(
-        '[[fault]]\nname = "ghost"\nkind = "false-star"\nat_s = 0.0\nfor_s = 9.0\nradec_deg = [84.05, -1.2]\nv_mag = 2.0\n'
+        '[[fault]]\nname = "ghost"\nkind = "false-star"\nat_s = 0.0\nfor_s = 9.0\nradec_deg ='
+        " [84.05, -1.2]\nv_mag = 2.0\n"
     )
     rows = "\n".join(f"{t_s},{','.join(map(repr, ORION_Q))}" for t_s in (0.0, 0.5))
     (tmp_path / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n{rows}\n")

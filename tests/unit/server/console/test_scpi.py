@@ -71,9 +71,10 @@ def test_every_command_has_its_short_and_its_long_form_in_any_case():
 
 def test_the_commands_of_the_issue_are_there():
     line = (
-        "*IDN?;*CLS;*RST;*OPC;*OPC?;*ESE 0;*ESR?;*SRE 0;*STB?;*TST?;*WAI;:SYST:ERR?;:SYST:VERS?;:STAT:OPER?;:STAT:QUES?;"
-        ":SKY:BLANK ON;:SKY:ATT 1,0,0,0;:SKY:RATE 0,0,0;:SKY:ATT?;:SKY:FAULT 'a';:LEDG:STATE ON;:TRAC:RES?;:FRAM:MISS?;"
-        ":SYST:AUTH 'b'"
+        "*IDN?;*CLS;*RST;*OPC;*OPC?;*ESE 0;*ESR?;*SRE"
+        " 0;*STB?;*TST?;*WAI;:SYST:ERR?;:SYST:VERS?;:STAT:OPER?;:STAT:QUES?;:SKY:BLANK ON;:SKY:ATT"
+        " 1,0,0,0;:SKY:RATE 0,0,0;:SKY:ATT?;:SKY:FAULT 'a';:LEDG:STATE"
+        " ON;:TRAC:RES?;:FRAM:MISS?;:SYST:AUTH 'b'"
     )
     assert len(patterns(line)) == 24
 

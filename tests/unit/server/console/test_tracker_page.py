@@ -95,7 +95,10 @@ def test_the_terminal_has_a_line_of_the_tracker():
         )
         return next((line.text, line.well) for line in status.lines(1) if line.label == "tracker")
 
-    text = "1.0, -2.0, 30.0 arcsec off, rms 1.5, 2.5, 3.5, 75.0 % available, 150 ms late, track; 1 of 12 answers wrong"
+    text = (
+        "1.0, -2.0, 30.0 arcsec off, rms 1.5, 2.5, 3.5, 75.0 % available, 150 ms late, track; 1 of"
+        " 12 answers wrong"
+    )
     assert line(FIGURES) == (text, True)
     assert line(msgspec.structs.replace(FIGURES, silent="gone")) == ("gone", False)
     assert line(TrackerFigures())[0] == "- arcsec off, rms -, - available, - late; 0 answers"

@@ -191,7 +191,10 @@ def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
     (tmp_path / "t.csv").write_text("ra,dec,vmag,b-v\n" + "\n".join(rows) + "\n")
     catalog = read(tmp_path / "t.csv")
     assert sorted(catalog.ra_deg.tolist()) == [1.0, 340.0]
-    counts = "1 without a place, 3 without a magnitude and a colour, 1 beyond what a star has, 1 repeated"
+    counts = (
+        "1 without a place, 3 without a magnitude and a colour, 1 beyond what a star has, 1"
+        " repeated"
+    )
     assert counts in caplog.text
     assert catalog.notes[0].endswith(counts)
 
@@ -225,22 +228,29 @@ HEAD = "ra,dec,vmag,b-v\n"
 REFUSED = {
     "": "is empty; give a table of stars",
     HEAD: "has no rows",
-    "x,y\n1,2\n": "no right ascension and declination among its columns (x, y); name them ra and dec",
-    "ra,dec,mass\n1,2,3\n": "no magnitude with a colour among its columns (ra, dec, mass); name V with B-V",
+    "x,y\n1,2\n": (
+        "no right ascension and declination among its columns (x, y); name them ra and dec"
+    ),
+    "ra,dec,mass\n1,2,3\n": (
+        "no magnitude with a colour among its columns (ra, dec, mass); name V with B-V"
+    ),
     "hello\nworld\n": "its first line names no columns",
     HEAD + "12:00:00,-01:02:03,5,0.1\n": "is no column of numbers (its first is '",
-    HEAD
-    + "1,2,nan,0.1\n1,2,5,\n": "none of its 2 rows is a star (2 without a magnitude and a colour)",
+    HEAD + "1,2,nan,0.1\n1,2,5,\n": (
+        "none of its 2 rows is a star (2 without a magnitude and a colour)"
+    ),
     HEAD + "1,2,3,0.1\n1,2,3,4,5\n": "cannot be read",
     "ra,dec,vmag,b-v,pmra,pmdec\n1,2,3,0.1,5,5\n": "write [sky] catalogue_epoch_jyear",
     "ra,dec,vmag,b-v,pmra,pmdec,ref_epoch\n1,2,3,0.1,5,5,1\n": "column ref_epoch is no Julian year",
-    "source_id,ra,dec,vmag,b-v\n"
-    + "9" * 30
-    + ",1,2,3,0.1\n": "column source_id is no column of numbers",
+    "source_id,ra,dec,vmag,b-v\n" + "9" * 30 + ",1,2,3,0.1\n": (
+        "column source_id is no column of numbers"
+    ),
     HEAD.strip() + "," + "x," * 2000 + "\n": "its first line names more than 1000 columns",
     "# %ECSV 1.0\n# ---\n# datatype: {\nra dec\n1 2\n": "cannot be read",
     '<?xml version="1.0"?><VOTABLE>': "cannot be read",
-    '<?xml version="1.0"?><VOTABLE><STREAM\nencoding="base64" href="http://127.0.0.1/"/></VOTABLE>': "at another place",
+    '<?xml version="1.0"?><VOTABLE><STREAM\nencoding="base64" href="http://127.0.0.1/"/></VOTABLE>': (
+        "at another place"
+    ),
 }
 
 

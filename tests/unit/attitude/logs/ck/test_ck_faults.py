@@ -154,8 +154,8 @@ def test_a_missing_kernel_is_named_with_the_option(tmp_path, raw):
                 handle, 3, ck.Motion(np.random.default_rng(1)), TIMES, reference="PROBE_TABLE"
             )
     assert (
-        "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc"
-        in refusal(tmp_path / "a.bc")
+        "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own"
+        " .bc, or .tpc" in refusal(tmp_path / "a.bc")
     )
 
 
@@ -163,7 +163,10 @@ def test_a_missing_kernel_is_named_with_the_option(tmp_path, raw):
 def test_a_meta_kernel_gives_its_kernels(tmp_path, raw, relative):
     part = tmp_path.as_posix()
     files = "'$K/leap.tls' '$K/clock.tsc'" if not relative else "'$K/le+' 'ap.tls' '$K/clock.tsc'"
-    meta = f"KPL/MK\n\\begindata\nPATH_SYMBOLS = ( 'K' )\nPATH_VALUES = ( '{part[:30]}+' '{part[30:]}' )\n"
+    meta = (
+        f"KPL/MK\n\\begindata\nPATH_SYMBOLS = ( 'K' )\nPATH_VALUES = ( '{part[:30]}+'"
+        f" '{part[30:]}' )\n"
+    )
     (tmp_path / "all.tm").write_text(f"{meta}KERNELS_TO_LOAD = ( {files} )\n\\begintext\n")
     with spiceypy.KernelPool([]):
         found, _ = answer(tmp_path / "whole.bc", [tmp_path / "all.tm"], None)

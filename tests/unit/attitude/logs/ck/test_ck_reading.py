@@ -111,7 +111,7 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
     path = folder / "a.bc"
     write_kind(path, motion, kind, subtype, rates)
     found, _ = read(path)
-    samples = [AttitudeSample(t, q, rate, 0, b) for t, q, rate, b in zip(found.t_ns.tolist(), found.q, found.rate, found.breaks, strict=True)]  # fmt: skip  # noqa: E501
+    samples = [AttitudeSample(t, q, rate, 0, b) for t, q, rate, b in zip(found.t_ns.tolist(), found.q, found.rate, found.breaks, strict=True)]  # fmt: skip
     timeline = log_timeline(samples, ALL, log_joins(samples))
     assert found.step_s is not None
     assert found.error_rad < BETWEEN_RAD
@@ -285,7 +285,10 @@ def test_of_numbered_kernels_beside_the_ck_the_last_by_number_counts(folder, mot
         ck.write_segment(handle, 3, motion, TIMES)
     log = open_log(folder / "a.bc")
     assert log.samples[0].t_ns == J2000_NS + round(ck.START_S + 60.0) * NS_PER_S
-    line = "kernels from beside the CK: leap.tls, clock_9.tsc, clock_10.tsc; where they differ, the last counts (clock_10.tsc)"
+    line = (
+        "kernels from beside the CK: leap.tls, clock_9.tsc, clock_10.tsc; where they differ, the"
+        " last counts (clock_10.tsc)"
+    )
     assert ("kernels", f"{line}; --kernel names others") in log.told
 
 

@@ -59,12 +59,14 @@ WRITERS = {
     "other MCAP, zstd": lambda path, sent: write_mcap(
         path / "a.mcap", sent("jazzy"), compression=CompressionType.ZSTD
     ),
-    "ROS 1 of another name": lambda path, sent: write_bag1(path / "a.bag", sent("noetic")).rename(
-        path / "flight.log"
+    "ROS 1 of another name": (
+        lambda path, sent: write_bag1(path / "a.bag", sent("noetic")).rename(path / "flight.log")
     ),
-    "db3 of another name": lambda path, sent: (
-        write_bag2(path / "a", sent("jazzy")) / "a.db3"
-    ).rename(path / "flight.log"),
+    "db3 of another name": (
+        lambda path, sent: (write_bag2(path / "a", sent("jazzy")) / "a.db3").rename(
+            path / "flight.log"
+        )
+    ),
 }
 
 

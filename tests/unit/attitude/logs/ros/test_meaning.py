@@ -265,7 +265,10 @@ def test_of_several_topics_one_is_chosen_by_name(bag):
     path = bag(
         [*poses("icrs", rotations(2), "/a/pose"), *poses("icrs", rotations(3, seed=9), "/b/pose")]
     )
-    several = r"several topics with attitudes: /a/pose \(geometry_msgs/PoseStamped\), /b/pose .*; choose one with --topic NAME"
+    several = (
+        r"several topics with attitudes: /a/pose \(geometry_msgs/PoseStamped\), /b/pose .*; choose"
+        r" one with --topic NAME"
+    )
     with pytest.raises(InputError, match=several):
         open_log(path)
     assert len(open_log(path, Stated(topic="/b/pose")).samples) == 3
@@ -284,7 +287,10 @@ def test_a_topic_of_a_type_that_says_no_attitude_is_refused(bag):
         open_log(bag([point]))
     with pytest.raises(
         InputError,
-        match=r"/p is of geometry_msgs/msg/Vector3, which says no attitude; read are Imu, Odometry, Pose",
+        match=(
+            r"/p is of geometry_msgs/msg/Vector3, which says no attitude; read are Imu, Odometry,"
+            r" Pose"
+        ),
     ):
         open_log(bag([point, *poses("icrs", rotations(2))]), Stated(topic="/p"))
 

@@ -144,7 +144,9 @@ def test_what_tf_leaves_open_is_refused_by_name(bag):
     two = bag(tree([("map", "odom", rotations(3)), ("odom", "base", rotations(3, seed=7))]))
     with pytest.raises(
         InputError,
-        match="several transforms of tf could be meant: map -> odom, odom -> base; choose with --body",
+        match=(
+            "several transforms of tf could be meant: map -> odom, odom -> base; choose with --body"
+        ),
     ):
         open_log(two, Stated(reference="icrs"))
     assert len(open_log(two, Stated(reference="odom=icrs", body="base")).samples) == 3

@@ -107,7 +107,10 @@ def test_a_wrong_fault_is_refused_with_its_key_and_what_to_write(change, said):
             "17 gradients and maps",
         ),
         (
-            '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 5000\nelectrons = 1\nlength_px = 500',
+            (
+                '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 5000\nelectrons ='
+                " 1\nlength_px = 500"
+            ),
             "write at most 20000 px together",
         ),
         ('[[fault]]\nkind = "flash"\nname = "f"\nhip = 1\nelectrons = 1', "write for_s = 0.1"),

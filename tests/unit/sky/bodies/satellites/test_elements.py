@@ -143,7 +143,10 @@ def as_xml(fields):
     }
     data = "".join(f"<{part}>{inner[part]}</{part}>" for part in ("meanElements", "tleParameters"))
     segment = f"<segment><metadata>{inner['metadata']}</metadata><data>{data}</data></segment>"
-    return f'<?xml version="1.0"?><ndm><omm id="CCSDS_OMM_VERS" version="2.0"><body>{segment}</body></omm></ndm>'
+    return (
+        '<?xml version="1.0"?><ndm><omm id="CCSDS_OMM_VERS"'
+        f' version="2.0"><body>{segment}</body></omm></ndm>'
+    )
 
 
 def as_kvn(fields):

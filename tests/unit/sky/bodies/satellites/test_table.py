@@ -13,7 +13,10 @@ from tests.support.skies import STATION_TLE
 
 def test_each_satellite_has_its_row_and_others_the_default():
     found = read_satellites(STATION_TLE + element_set(7, (0.0, 0.0, 0.0, 0.0), 0.0, 1.0027), "f", 0)
-    text = "# seen\nNORAD, standard_mag,period_s,amplitude_mag,size_m\r\n25544,-1.8,,,109\n\n00099,3,1,2,\n"
+    text = (
+        "# seen\nNORAD,"
+        " standard_mag,period_s,amplitude_mag,size_m\r\n25544,-1.8,,,109\n\n00099,3,1,2,\n"
+    )
     light = brightness_of(found, read_table(text, "table.csv"), 6.0, 1000.0)
     assert np.allclose(
         light.standard_e_per_s, 1000.0 * 10 ** (-0.4 * np.array([-1.8, 6.0])), rtol=1e-12

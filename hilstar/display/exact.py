@@ -25,7 +25,7 @@ from hilstar.display.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, W
 from hilstar.display.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
 from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
 KEPT = 8
@@ -67,7 +67,7 @@ def nothing_carried(count: int) -> Carried:
 @dataclass(frozen=True, slots=True)
 class Left:
     """The errors (SUMS, n) that the stars of a frame leave to the next one, and their numbers
-    (n,) as in `Sprites.star`.
+    (n,) as in `FrameLight.star`.
     """
 
     star: IntArray
@@ -126,7 +126,7 @@ class ExactQuantiser(quantise.Quantiser):
         uniformity = panel.uniformity
         self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
 
-    def draw(self, light: quantise.FrameLight) -> Levels:
+    def draw(self, light: quantise.UnquantisedFrame) -> Levels:
         """The levels of the next frame: its stars are added to its dithered extended light."""
         if light.sprites is None or not light.sprites.extended:
             return self.levels(light.sprites)
@@ -174,7 +174,7 @@ class ExactQuantiser(quantise.Quantiser):
         """The rate of half a step: any pixel of the star may show it."""
         return panel.response.half_step * panel.flux_at_white_e_per_s
 
-    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
+    def levels(self, sprites: FrameLight | None, floor: Levels | None = None) -> Levels:
         """The levels of `sprites` (None: black), (height, width); the next call overwrites the same
         array.
 
@@ -211,7 +211,7 @@ class ExactQuantiser(quantise.Quantiser):
             order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order)
         )
 
-    def _carried(self, sprites: Sprites) -> Carried:
+    def _carried(self, sprites: FrameLight) -> Carried:
         """The errors that each sprite begins with: what its light in other primaries left, or
         none.
         """
@@ -227,7 +227,7 @@ class ExactQuantiser(quantise.Quantiser):
         """
         return error
 
-    def _keep(self, sprites: Sprites, left: Float32Array) -> None:
+    def _keep(self, sprites: FrameLight, left: Float32Array) -> None:
         """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
         self.over = left
 
@@ -315,7 +315,7 @@ def _part(found: Footprints, some: IntArray) -> Footprints:
     )
 
 
-def _turns(sprites: Sprites) -> Iterator[IntArray]:
+def _turns(sprites: FrameLight) -> Iterator[IntArray]:
     """The sprites in chunks, each of a path after those before it; a long path is begun anew in
     places.
     """
@@ -331,7 +331,7 @@ def _turns(sprites: Sprites) -> Iterator[IntArray]:
             yield turn[start : start + CHUNK]
 
 
-def _sprites_in_path(sprites: Sprites) -> IntArray:
+def _sprites_in_path(sprites: FrameLight) -> IntArray:
     if sprites.per_star == 1:
         return np.ones(len(sprites), dtype=np.intp)
     begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
@@ -339,7 +339,9 @@ def _sprites_in_path(sprites: Sprites) -> IntArray:
     return np.asarray(np.repeat(lengths, lengths))
 
 
-def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites: Sprites) -> None:
+def _hand_on(
+    carried: Float32Array, left: Float32Array, some: IntArray, sprites: FrameLight
+) -> None:
     """Give the errors `left` (SUMS, n) of sprites `some` to those that follow them in their
     paths, about their centres.
     """

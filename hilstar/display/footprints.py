@@ -17,7 +17,7 @@ from hilstar.display.quantise import Panel
 from hilstar.display.response import Levels
 from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 PlaceArray = npt.NDArray[np.int32]  # half the memory of intp: these arrays are the method's largest
 PHASES = 8  # sub-pixel phases per axis for which the order is tabulated
@@ -126,7 +126,7 @@ class FootprintMap:
         self._last_entry = np.empty(self.pixels + 1, dtype=np.int32)
         self._contested = np.zeros(self.pixels + 1, dtype=np.bool_)
 
-    def find(self, sprites: Sprites) -> Footprints:
+    def find(self, sprites: FrameLight) -> Footprints:
         """The footprints of `sprites`. Raises InputError for sprites of another PSF's footprint."""
         order = self.order
         if sprites.footprint_px != order.size:
@@ -194,7 +194,7 @@ class FootprintMap:
 
 
 def star_losses_mag(
-    sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Levels
+    sprites: FrameLight, panel: Panel, footprints: FootprintMap, levels: Levels
 ) -> FloatArray:
     """How many magnitudes fainter than wanted each of n sprites is in `levels` (height, width),
     (n,).

@@ -11,10 +11,10 @@ import numpy as np
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.units import flux_ratio, magnitude
 from hilstar.display.balance import Balance
-from hilstar.display.quantise import FrameLight, Panel, shown_light
+from hilstar.display.quantise import Panel, UnquantisedFrame, shown_light
 from hilstar.display.quantisers import QUANTISERS, Quantisation
 from hilstar.optics.psf import GaussianPsf, Psf
-from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, pack_sprites
 
 USUAL_PSF = GaussianPsf((0.85, 0.85))
 WHITE = 1.0
@@ -40,7 +40,7 @@ class Errors:
 
 def phase_grid(
     count: int, psf: Psf = USUAL_PSF, first: tuple[float, float] = MIDDLES
-) -> tuple[Sprites, int]:
+) -> tuple[FrameLight, int]:
     """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel;
     and the tile's side, px.
 
@@ -54,7 +54,7 @@ def phase_grid(
     return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, psf.footprint_px), tile
 
 
-def line_places(sprites: Sprites) -> tuple[FloatArray, FloatArray]:
+def line_places(sprites: FrameLight) -> tuple[FloatArray, FloatArray]:
     """Where a `phase_grid` has the stars of each column of tiles, x (count,) in px, and of each
     row, y.
     """
@@ -62,7 +62,7 @@ def line_places(sprites: Sprites) -> tuple[FloatArray, FloatArray]:
     return sprites.x_px[:count], sprites.y_px[::count]
 
 
-def phase_image(sprites: Sprites, psf: Psf) -> FloatArray:
+def phase_image(sprites: FrameLight, psf: Psf) -> FloatArray:
     """The light (h, w) of the stars of a `phase_grid`: all are as bright, and stand in columns
     and rows.
     """
@@ -79,11 +79,11 @@ def phase_image(sprites: Sprites, psf: Psf) -> FloatArray:
     return image
 
 
-def fainter(sprites: Sprites, mag: float | FloatArray) -> Sprites:
+def fainter(sprites: FrameLight, mag: float | FloatArray) -> FrameLight:
     """The same stars, `mag` magnitudes fainter: all, or each by its own (n,)."""
     data = sprites.data.copy()
     data["electrons_per_s"] *= flux_ratio(mag)
-    return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
+    return FrameLight(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
 
 
 def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
@@ -110,7 +110,7 @@ def shown_by(
     exposure_frames: int,
     panel: Panel,
     linear: Float32Array,
-    sprites: Sprites,
+    sprites: FrameLight,
     balance: Balance,
 ) -> FloatArray:
     """The light (h, w) that a method shows for a linear image, with `temporal` the mean of
@@ -121,7 +121,7 @@ def shown_by(
     quantiser = QUANTISERS[method](panel, linear.shape[::-1], balance.psf, balance.seen)
     exposed = quantiser.exposure(FRAMES_BEFORE, exposure_frames)
     levels = (
-        quantiser.draw(FrameLight(sprites, lambda: linear, lambda: linear, number))
+        quantiser.draw(UnquantisedFrame(sprites, lambda: linear, lambda: linear, number))
         for number in range(exposed.stop)
     )
     shown = (shown_light(each, panel) for each in islice(levels, exposed.start, None))

@@ -26,7 +26,7 @@ from hilstar.basics.errors import InputError
 from hilstar.display.balance import AS_USUAL, Seen
 from hilstar.display.response import Levels, Response, encode
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/make_blue_noise.py
 
@@ -79,7 +79,7 @@ class Panel:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameLight:
+class UnquantisedFrame:
     """The light of one frame: its sprites (None: black), and functions that draw it all, and its
     discs and stray light alone.
 
@@ -87,7 +87,7 @@ class FrameLight:
     the frames shown.
     """
 
-    sprites: Sprites | None
+    sprites: FrameLight | None
     linear: Callable[[], Float32Array]
     extended: Callable[[], Float32Array]
     number: int = 0
@@ -128,7 +128,7 @@ class Quantiser(ABC):
         self._panel = panel
 
     @abstractmethod
-    def draw(self, light: FrameLight) -> Levels:
+    def draw(self, light: UnquantisedFrame) -> Levels:
         """The levels of the next frame (height, width); the next call may overwrite them."""
 
     @abstractmethod
@@ -181,7 +181,7 @@ class PixelQuantiser(Quantiser):
     def levels(self, linear_e_per_s: Float32Array, number: int = 0) -> Levels:
         """The levels of a linear image (height, width), which is that of frame `number`."""
 
-    def draw(self, light: FrameLight) -> Levels:
+    def draw(self, light: UnquantisedFrame) -> Levels:
         """The levels of the next frame."""
         return self.levels(light.linear(), light.number)
 

@@ -20,7 +20,7 @@ from hilstar.display.footprints import PixelOrder
 from hilstar.display.quantise import Panel, mask_turn
 from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 # What a star is given to make up for, in its largest steps: more than the 3 that occur, little
 # enough for one that cannot (its pixels are white) to be right again a few frames after it can.
@@ -62,13 +62,13 @@ class TemporalQuantiser(ExactQuantiser):
         """See `mask_turn`."""
         return mask_turn(number)
 
-    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
+    def levels(self, sprites: FrameLight | None, floor: Levels | None = None) -> Levels:
         """The levels of the next frame, as `exact`'s."""
         if sprites is None or not len(sprites):
             self.left = None
         return super().levels(sprites, floor)
 
-    def _carried(self, sprites: Sprites) -> Carried:
+    def _carried(self, sprites: FrameLight) -> Carried:
         first, _ = ends_of_paths(sprites)
         star = sprites.star[first]
         before = places_before(None if self.left is None else self.left.star, star)
@@ -83,12 +83,12 @@ class TemporalQuantiser(ExactQuantiser):
         limit = np.float32(MAX_CARRIED_STEPS) * step.max(axis=0)
         return np.clip(error, -limit, limit)
 
-    def _keep(self, sprites: Sprites, left: Float32Array) -> None:
+    def _keep(self, sprites: FrameLight, left: Float32Array) -> None:
         _, last = ends_of_paths(sprites)
         self.left = Left(sprites.star[last].copy(), left[:, last])
 
 
-def ends_of_paths(sprites: Sprites) -> tuple[IntArray, IntArray]:
+def ends_of_paths(sprites: FrameLight) -> tuple[IntArray, IntArray]:
     """The places of the first and of the last sprite of each star."""
     if sprites.per_star == 1:
         every = np.arange(len(sprites))

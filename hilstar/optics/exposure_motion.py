@@ -21,7 +21,7 @@ from hilstar.optics.camera import Camera
 from hilstar.optics.frame_motion import Scan
 from hilstar.optics.paths import MAX_NODES, Chords, Paths, node_counts, nodes_of
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites, join_sprites, make_sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import Stars
 
 # With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's
@@ -97,7 +97,7 @@ def own_row_s(
 
 def smeared_sprites(
     stars: Stars, motion: Motion, camera: Camera, psf: Psf, scan: Scan = AT_ONCE
-) -> Sprites:
+) -> FrameLight:
     """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite.
 
     `scan` says over how long rows begin, and in which direction. `capped` stars are drawn coarser
@@ -132,7 +132,7 @@ def smeared_sprites(
     fineness = 1.0
     while fineness >= MIN_COARSENESS:
         smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness, scan)
-        chain: list[Sprites] = []
+        chain: list[FrameLight] = []
         total = 0
         for begin, end in itertools.pairwise(
             np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s
@@ -165,7 +165,7 @@ class _Smear:
     nodes_per_sigma: float
     scan: Scan
 
-    def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> Sprites:
+    def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> FrameLight:
         """The sprites of a piece of an exposure that is `part` of it."""
         camera, stars = self.camera, self.stars
         angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (

@@ -2,7 +2,8 @@
 before levels are chosen.
 
 Its unit is that of the linear image, electrons per second of each pixel. It travels in a frame's
-`Sprites.extended` and is drawn in order, before the sprites. Compared by identity: one object drawn
+`FrameLight.extended` and is drawn in order, before the sprites. Compared by identity: one object
+drawn
 twice is the same light. A small disc is a map of its spread places, a larger one is drawn ray by
 ray.
 """

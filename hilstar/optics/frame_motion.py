@@ -25,7 +25,7 @@ from hilstar.optics.paths import (
     within_budget,
 )
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites, brightest, max_stars, pack_sprites
+from hilstar.optics.sprites import FrameLight, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 
 # With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's
@@ -126,7 +126,9 @@ class CameraTurn:
         return float(np.linalg.norm(self.rate_cam_rad_s))
 
 
-def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, psf: Psf) -> Sprites:
+def swept_sprites(
+    stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, psf: Psf
+) -> FrameLight:
     """Sprites of each star on its path while its row is lit; the sprites of a star follow each
     other.
 

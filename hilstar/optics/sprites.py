@@ -125,7 +125,7 @@ class AddedLight:
 
 
 @dataclass(frozen=True, slots=True)
-class Sprites:
+class FrameLight:
     """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in
     `Stars`.
 
@@ -173,7 +173,7 @@ def make_sprites(
     camera: Camera,
     footprint_px: int,
     candidates: Candidates | None = None,
-) -> Sprites:
+) -> FrameLight:
     """The sprites of every star whose footprint touches the image, centres off the edge included.
 
     `icrs_to_image` (3, 3) turns ICRS components into image components. With `candidates` of the
@@ -196,7 +196,7 @@ def make_sprites(
         return sprites
     dropped = len(sprites) - len(kept)
     star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
-    return Sprites(sprites.data[kept], footprint_px, star, x_px, y_px, capped=dropped)
+    return FrameLight(sprites.data[kept], footprint_px, star, x_px, y_px, capped=dropped)
 
 
 def max_stars(footprint_px: int) -> int:
@@ -218,7 +218,7 @@ def pack_sprites(
     star: IntArray,
     size_px: tuple[int, int],
     footprint_px: int,
-) -> Sprites:
+) -> FrameLight:
     """Sprites of the stars at `x_px`, `y_px` (n,) whose footprints touch an image of `size_px`
     (width, height).
 
@@ -241,25 +241,25 @@ def pack_sprites(
         whole[:, column] = pixel
         part[:, 2 + column] = place_px - pixel
     part[:, 4] = electrons_per_s.take(seen)
-    return Sprites(data, footprint_px, star.take(seen), x_px, y_px)
+    return FrameLight(data, footprint_px, star.take(seen), x_px, y_px)
 
 
 def _between(place_px: FloatArray, first: float, end: float) -> npt.NDArray[np.bool_]:
     return np.asarray((place_px >= first) & (place_px < end))
 
 
-def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
+def join_sprites(parts: Sequence[FrameLight], footprint_px: int) -> FrameLight:
     """All sprites of `parts`, which have one footprint."""
     if not parts:
         nothing = np.empty(0)
-        return Sprites(
+        return FrameLight(
             np.empty(0, dtype=SPRITE_DTYPE),
             footprint_px,
             np.empty(0, dtype=np.intp),
             nothing,
             nothing,
         )
-    return Sprites(
+    return FrameLight(
         np.concatenate([part.data for part in parts]),
         footprint_px,
         np.concatenate([part.star for part in parts]),
@@ -268,12 +268,12 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
     )
 
 
-def without_stars(sprites: Sprites) -> Sprites:
+def without_stars(sprites: FrameLight) -> FrameLight:
     """The extended light of sprites alone."""
     return replace(join_sprites([], sprites.footprint_px), extended=sprites.extended)
 
 
-def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
+def with_sprites(sprites: FrameLight, parts: Sequence[FrameLight]) -> FrameLight:
     """Sprites and those of `parts`, which have the same footprint, end to end; the rest stays
     that of the first.
     """
@@ -281,7 +281,7 @@ def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
     return replace(sprites, data=joined.data, star=joined.star, x_px=joined.x_px, y_px=joined.y_px)
 
 
-def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
+def by_channel(sprites: FrameLight, stars: Stars) -> list[FrameLight]:
     """The sprites of each channel of the tracker: every light times its share there; the sprites
     themselves where it has one.
 
@@ -319,7 +319,7 @@ def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
 
 
 def shares_of_sprites(
-    sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None
+    sprites: FrameLight, stars: Stars, shares: FloatArray, by_bv: FloatArray | None
 ) -> FloatArray:
     """The shares (n, columns) of each sprite's light, by those of each star; see `by_share`."""
     found, added = shares_at(shares, stars, sprites.star), sprites.star < 0
@@ -329,7 +329,7 @@ def shares_of_sprites(
     return found
 
 
-def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
+def by_primary(sprites: FrameLight, places_px: FloatArray, k: int) -> FrameLight:
     """The sprites of primary `k`, each where it is drawn so that its light, at its place (3, 2)
     within a pixel, lies there.
     """
@@ -357,8 +357,8 @@ def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
 
 
 def by_share(
-    sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
-) -> list[Sprites]:
+    sprites: FrameLight, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
+) -> list[FrameLight]:
     """The sprites once for each column of `shares` (stars, columns): every light times its star's
     or body's share.
 
@@ -377,7 +377,7 @@ def by_share(
 
 
 def extended_by_share(
-    sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
+    sprites: FrameLight, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
 ) -> list[tuple[ExtendedLight, ...]]:
     """The extended light of sprites once for each column of `shares`, as `by_share`."""
     bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
@@ -400,7 +400,7 @@ def extended_by_share(
 
 
 def clipped_sprites(
-    sprites: Sprites,
+    sprites: FrameLight,
     psf: Psf,
     flux_at_white_e_per_s: float,
     resolution_px: tuple[int, int],
@@ -443,7 +443,7 @@ def clipped_sprites(
     return np.asarray(bright[over], dtype=np.intp)
 
 
-def _light_at(sprites: Sprites, x: IntArray, y: IntArray, psf: Psf) -> FloatArray:
+def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatArray:
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
     pixel, reach = sprites.data["pixel"], sprites.footprint_px / 2
     # Sprites whose footprints can reach one of the columns and rows, and some more

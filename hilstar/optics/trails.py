@@ -20,7 +20,7 @@ from hilstar.optics.camera import Camera
 from hilstar.optics.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, disc_lights
 from hilstar.optics.paths import Chords, Paths
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites, pack_sprites, with_sprites
+from hilstar.optics.sprites import FrameLight, pack_sprites, with_sprites
 from hilstar.sky.bodies.disc import Disc
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Trails:
     `index`, their mean rates (k,).
     """
 
-    sprites: Sprites
+    sprites: FrameLight
     index: IntArray
     electrons_per_s: FloatArray
     # unit vectors (k, 3), ICRS, in the middle of each one's time, as `Pass.directions`
@@ -180,7 +180,7 @@ def sprite_counts(
     return wanted, (begin, end)
 
 
-def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
+def with_trails(sprites: FrameLight, found: Trails, first: int) -> FrameLight:
     """Stars' sprites and after them those of satellites, whose places in `Stars` begin at
     `first`.
     """
@@ -291,7 +291,7 @@ def _lights(
     return disc_lights(disc, DiscView(view.camera, brush.psf, (Pose(turned, share),)), covers)
 
 
-def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprites:
+def hidden(sprites: FrameLight, directions: FloatArray, found: DiscTrail) -> FrameLight:
     """Sprites of stars seen in `directions` (n, 3), each without the share of its light that a
     satellite hides.
     """

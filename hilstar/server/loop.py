@@ -23,7 +23,7 @@ from hilstar.optics.layers.fault_kinds import Freeze, Now
 from hilstar.optics.layers.fault_light import FaultView
 from hilstar.optics.layers.faults import FaultLayer
 from hilstar.optics.layers.view import View
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.bench.frame import Bench, Drawn
 from hilstar.server.operator import OnScreen
@@ -249,7 +249,7 @@ class FrameLoop:
 
     def _light(
         self, attitude: Attitude | None, t_ns: int, faults: FaultLayer | None
-    ) -> Sprites | None:
+    ) -> FrameLight | None:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None

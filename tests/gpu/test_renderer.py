@@ -15,7 +15,7 @@ from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.response import encode, srgb_response
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from tests.support.stars import sprites_at
 
 # The issue's limits. Measured on llvmpipe: 1.2e-6 and 1.0e-5 px at worst, the footprint's cut
@@ -37,7 +37,7 @@ BOTH_WAYS = pytest.mark.parametrize("bits", [8, None], ids=["beside codes", "alo
 
 def draw(
     target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None, Sprites]:
+) -> tuple[np.ndarray, np.ndarray | None, FrameLight]:
     with Renderer(target) as gl:
         assert gl.gl_error() == "GL_NO_ERROR"
         sprites = sprites_at(pixels, electrons_per_s, gl.footprint_px)

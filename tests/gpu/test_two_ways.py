@@ -22,7 +22,7 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, pack_sprites
 from hilstar.server.bench.build import load
 from hilstar.server.record.ledger import Ledger, LedgerSwitch
 from hilstar.server.replay import DrawnBy, Wanted, plan_play, replay
@@ -39,7 +39,7 @@ SRGB8 = srgb_response(8)
 OTHER = 1e-4
 
 
-def stars(count: int, sigma_px, rng, per_star: int = 1) -> Sprites:
+def stars(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
     """Stars all over the image and its edges, many faint ones and few that clip, or paths of
     `per_star` sprites.
     """
@@ -54,7 +54,7 @@ def stars(count: int, sigma_px, rng, per_star: int = 1) -> Sprites:
     return replace(packed, per_star=per_star)
 
 
-def drawn(target: Target, frames: list[Sprites]) -> list[np.ndarray]:
+def drawn(target: Target, frames: list[FrameLight]) -> list[np.ndarray]:
     with Renderer(target) as gl:
         found = []
         for number, sprites in enumerate(frames):
@@ -65,7 +65,7 @@ def drawn(target: Target, frames: list[Sprites]) -> list[np.ndarray]:
 
 
 def both_ways(
-    target: Target, frames: list[Sprites], monkeypatch
+    target: Target, frames: list[FrameLight], monkeypatch
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The codes of frames star by star, and by points."""
     with Renderer(target) as gl:

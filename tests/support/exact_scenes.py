@@ -12,7 +12,7 @@ from hilstar.display.quantise import Panel, round_levels, shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import Response, gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, pack_sprites
 from tests.support.centroiders import family_errors_px
 
 WHITE = 1e6  # e-/s of a pixel
@@ -38,7 +38,7 @@ class Scene:
     whole star.
     """
 
-    sprites: Sprites
+    sprites: FrameLight
     windows: list[tuple[slice, slice]]
     response: Response
     sigma_px: tuple[float, float] = USUAL

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.optics.sprites import SPRITE_DTYPE, Sprites
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import Stars, make_stars
 
@@ -22,13 +22,13 @@ def stars_at(vectors: np.ndarray, electrons_per_s: np.ndarray) -> Stars:
     return make_stars(catalog, vectors, np.full(n, 5000.0), electrons_per_s)
 
 
-def sprites_at(pixels: np.ndarray, electrons_per_s: np.ndarray, footprint: int) -> Sprites:
+def sprites_at(pixels: np.ndarray, electrons_per_s: np.ndarray, footprint: int) -> FrameLight:
     """Sprites centred on pixel positions (n, 2), with the light of each."""
     data = np.empty(len(pixels), dtype=SPRITE_DTYPE)
     whole = np.floor(pixels + (0.5 if footprint % 2 else 0.0))
     data["pixel"] = whole
     data["fraction_px"] = pixels - whole
     data["electrons_per_s"] = electrons_per_s
-    return Sprites(
+    return FrameLight(
         data, footprint, np.arange(len(pixels)), pixels[:, 0].copy(), pixels[:, 1].copy()
     )

@@ -24,7 +24,7 @@ from hilstar.optics.extended import LightMap
 from hilstar.optics.frame_motion import Orientation
 from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites, by_channel, by_primary, without_stars
+from hilstar.optics.sprites import FrameLight, by_channel, by_primary, without_stars
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class Target:
         return found
 
     def by_plane(
-        self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]
+        self, sprites: FrameLight | None, levels: Callable[[int, FrameLight | None], Levels]
     ) -> Levels:
         """The levels of a frame by those of each primary, if primaries are driven apart, chosen
         in their order.
@@ -190,7 +190,7 @@ class Backend(ABC):
     context: "Context | None"
 
     @abstractmethod
-    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+    def draw(self, sprites: FrameLight | None, frame: int = 0) -> None:
         """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear`
         and `levels`.
 
@@ -202,7 +202,7 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def draw_linear(self, sprites: Sprites) -> None:
+    def draw_linear(self, sprites: FrameLight) -> None:
         """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next
         `levels` are undefined.
 
@@ -286,7 +286,7 @@ class Backend(ABC):
         """Free what the backend holds."""
 
 
-def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
+def as_maps(sprites: FrameLight | None, target: Target) -> FrameLight | None:
     """Sprites whose PSF changes over the field as one map of their light, which NumPy adds up;
     all others as they are.
     """
@@ -307,7 +307,7 @@ def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
 
 
 def linear_light(
-    backend: Backend, sprites: Sprites, stars: Stars, drawn: bool = False
+    backend: Backend, sprites: FrameLight, stars: Stars, drawn: bool = False
 ) -> Float32Array:
     """The linear image of sprites by channel: float32 (channels, height, width), electrons per
     second, in memory of its own.

@@ -25,7 +25,7 @@ from hilstar.display.render.context import computes_in_software, is_software, pi
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import SPRITE_DTYPE, Sprites
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Tiles
@@ -141,7 +141,7 @@ class Planes:
         )
         return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
 
-    def packed(self, sprites: Sprites) -> Sprites:
+    def packed(self, sprites: FrameLight) -> FrameLight:
         """Sprites with `dtype`; their rate is then that of the white that they need for the
         primary that needs most.
         """
@@ -279,7 +279,7 @@ def lit_sides(
     return tuple(SpriteSide(min(rate, MAX_RATE), size) for size, rate in rates.items())
 
 
-def most_covered_px(sprites: Sprites, footprint_px: int, sides: SpriteSides, few_px: int) -> int:
+def most_covered_px(sprites: FrameLight, footprint_px: int, sides: SpriteSides, few_px: int) -> int:
     """Pixels that all sprites together may light, fainter stars within these sides; at most,
     where that is under `few_px`.
     """

@@ -29,7 +29,7 @@ from hilstar.display.render.encoder import (
 from hilstar.display.render.star_passes import TURNS_BINDING, StarPasses, turns_of
 from hilstar.display.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.optics.psf import PIXEL_VARIANCE
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of
@@ -188,7 +188,7 @@ class ExactPass:
         ]
 
     def draw(
-        self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None
+        self, buffer: moderngl.Buffer, sprites: FrameLight, passes: StarPasses | None = None
     ) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or
         else the linear image.

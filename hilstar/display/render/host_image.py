@@ -14,7 +14,7 @@ import numpy.typing as npt
 from hilstar.basics.arrays import IntArray
 from hilstar.display.render.context import MAX_ROUNDS, pinned
 from hilstar.display.render.encoder import Shares, build_compute
-from hilstar.optics.sprites import SPRITE_DTYPE, Sprites
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 
 BANDS = 16  # bands of rows, each drawn by one thread at a time; an even number
 FEW_PX = 12_800  # sprites' pixels that one thread draws before more threads would have begun
@@ -61,7 +61,7 @@ class HostImage:
     def _reserved(self) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=2 * self._capacity * SPRITE_DTYPE.itemsize, dynamic=True)
 
-    def draw(self, sprites: Sprites | None) -> None:
+    def draw(self, sprites: FrameLight | None) -> None:
         """Draw the light of sprites (None: none) in place of the last ones'; extended light is
         not drawn.
         """
@@ -88,7 +88,7 @@ class HostImage:
     def _is_few(self, sprites: int) -> bool:
         return sprites * self._footprint_px**2 <= FEW_PX
 
-    def _upload(self, sprites: Sprites) -> RowArray:
+    def _upload(self, sprites: FrameLight) -> RowArray:
         """Put the sprites into the buffer, by rows where they are many; their rows."""
         height, data = self._size_px[1], sprites.data
         before = (self._footprint_px - 1) // 2

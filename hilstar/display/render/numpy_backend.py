@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import MachineError, NotThereError
-from hilstar.display.quantise import FrameLight
+from hilstar.display.quantise import UnquantisedFrame
 from hilstar.display.render.aids import LINE_SHARE, lay_over
 from hilstar.display.render.backend import (
     EGL_LIBRARY,
@@ -28,7 +28,7 @@ from hilstar.display.render.backend import (
 from hilstar.display.render.reference import add_stars, extended_image
 from hilstar.display.response import Levels
 from hilstar.optics.extended import ExtendedLight
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 if TYPE_CHECKING:
     from moderngl import Context
@@ -94,12 +94,12 @@ class NumpyBackend(Backend):
         self._quantisers = target.quantisers()
         self._last_frame = NO_FRAME
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
-        self._sprites: Sprites | None = None
+        self._sprites: FrameLight | None = None
         self._levels: Levels | None = None
         # the last of each primary, and its image
         self._lights: dict[int, tuple[tuple[ExtendedLight, ...], FloatArray]] = {}
 
-    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+    def draw(self, sprites: FrameLight | None, frame: int = 0) -> None:
         """Draw `sprites` (None: blank); see `Backend.draw`."""
         if frame <= self._last_frame:
             self.begin_anew()
@@ -108,14 +108,14 @@ class NumpyBackend(Backend):
         if self._quantisers:
             self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
 
-    def _plane(self, frame: int, k: int, light: Sprites | None) -> Levels:
+    def _plane(self, frame: int, k: int, light: FrameLight | None) -> Levels:
         image, alone = (
             partial(self._image, light, True, k),
             partial(self._image, light, False, k, stars=False),
         )
-        return self._quantisers[k].draw(FrameLight(light, image, alone, frame))
+        return self._quantisers[k].draw(UnquantisedFrame(light, image, alone, frame))
 
-    def draw_linear(self, sprites: Sprites) -> None:
+    def draw_linear(self, sprites: FrameLight) -> None:
         """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
         self._sprites, self._linear = sprites, None
 
@@ -176,7 +176,7 @@ class NumpyBackend(Backend):
         """Do nothing."""
 
     def _image(
-        self, sprites: Sprites | None, shrunk: bool, plane: int = 0, stars: bool = True
+        self, sprites: FrameLight | None, shrunk: bool, plane: int = 0, stars: bool = True
     ) -> Float32Array:
         """The linear image of a plane, or its extended light; `shrunk` draws fainter stars
         within the target's `sides`.

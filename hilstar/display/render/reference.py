@@ -7,7 +7,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.optics.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 RAYS_ACROSS = 5  # a pixel, along either axis: a limb is then within 0.02 px
 MAX_AT_ONCE_PX = 2**20  # pixels of sprites that are computed at once, which bounds memory
@@ -16,7 +16,7 @@ REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
 def linear_image(
-    sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, footprint_px: int | None = None
+    sprites: FrameLight, resolution_px: tuple[int, int], psf: Psf, footprint_px: int | None = None
 ) -> FloatArray:
     """Electrons per second of each pixel, float64, shape (height, width): extended light, then
     sprites.
@@ -55,7 +55,7 @@ def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, 
 
 def add_stars(
     image: FloatArray,
-    sprites: Sprites,
+    sprites: FrameLight,
     psf: Psf,
     side_px: int,
     some: IntArray | slice = slice(None),

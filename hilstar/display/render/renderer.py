@@ -51,7 +51,7 @@ from hilstar.display.render.host_image import HostImage
 from hilstar.display.render.star_passes import ApartPasses, LightUnits, StarPasses
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Sure, Tiles
@@ -74,7 +74,7 @@ class Renderer(Backend):
         self.target = target
         self._planes = Planes.of(target)
         self.footprint_px = self._planes.footprint_px
-        self._undrawn: tuple[Sprites | None, bool] | None = None
+        self._undrawn: tuple[FrameLight | None, bool] | None = None
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
         self._by_pixel = quantiser.by_pixel()
@@ -228,7 +228,7 @@ class Renderer(Backend):
         if self._encoder is not None:
             self._encoder.take_places_from(self._buffer, self.footprint_px)
 
-    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+    def draw(self, sprites: FrameLight | None, frame: int = 0) -> None:
         """See `Backend.draw`."""
         with self._ctx:
             if frame <= self._last_frame:
@@ -278,7 +278,7 @@ class Renderer(Backend):
             else:
                 self._draw_by_points(sprites, unit_e_per_s)
 
-    def draw_linear(self, sprites: Sprites) -> None:
+    def draw_linear(self, sprites: FrameLight) -> None:
         """See `Backend.draw_linear`."""
         if self._planes.apart:
             self._white.draw_linear(sprites)
@@ -306,7 +306,7 @@ class Renderer(Backend):
         for one in self._exact_passes:
             one.left = None
 
-    def _draw_by_points(self, sprites: Sprites | None, unit_e_per_s: list[float] | None) -> None:
+    def _draw_by_points(self, sprites: FrameLight | None, unit_e_per_s: list[float] | None) -> None:
         """The linear image and its levels by rasterised sprites, in units where one is given."""
         few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
         sides = self._lit_sides if self._encoder is not None else ()
@@ -349,7 +349,7 @@ class Renderer(Backend):
         """The context in which a stage of a frame runs; see StagedRenderer."""
         return UNTIMED
 
-    def _choose(self, sprites: Sprites | None, passes: StarPasses | None) -> None:
+    def _choose(self, sprites: FrameLight | None, passes: StarPasses | None) -> None:
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last
         frame left.
         """
@@ -362,7 +362,7 @@ class Renderer(Backend):
             with self._stage("choose"):
                 one.draw(self._buffer if passes is None else passes.sprites, sprites, passes)
 
-    def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
+    def _draw_by_numpy(self, sprites: FrameLight | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
         target, levels, by_star = self.target, self._levels, self._by_star
         if levels is None or by_star is None:
@@ -383,7 +383,7 @@ class Renderer(Backend):
         )
         levels.write(self._exact_levels)
 
-    def _floor(self, sprites: Sprites, turn: float) -> LevelTexture:
+    def _floor(self, sprites: FrameLight, turn: float) -> LevelTexture:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in
         light.
 
@@ -410,7 +410,7 @@ class Renderer(Backend):
             self._floor_key = key
         return self._floor_levels
 
-    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> "Sure | None":
+    def _sure(self, quantiser: type[PixelQuantiser], sprites: FrameLight | None) -> "Sure | None":
         """What a quantiser's levels need not know of a disc's light, where there is one plane."""
         if self._planes.apart or not self._planes.panels:
             return None
@@ -425,7 +425,7 @@ class Renderer(Backend):
         places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
         return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
-    def _draw_extended(self, sprites: Sprites, sure: "Sure | None" = None) -> None:
+    def _draw_extended(self, sprites: FrameLight, sure: "Sure | None" = None) -> None:
         """Add extended light to the linear image, that of each primary to its plane alone."""
         fbo, self._regions = self._linear_fbo, ()
         for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
@@ -436,7 +436,7 @@ class Renderer(Backend):
 
     def _draw_linear(
         self,
-        sprites: Sprites | None,
+        sprites: FrameLight | None,
         whole: bool,
         levels: bool = True,
         in_units: bool = False,

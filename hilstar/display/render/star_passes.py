@@ -28,7 +28,7 @@ from hilstar.display.render.encoder import (
     write,
 )
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 LOCAL_SIZE = 32  # as in light.comp
 STEPS_BINDING, ORDER_BINDING, TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 1, 2, 3, 7, 8
@@ -113,7 +113,7 @@ class LightUnits:
             and level_steps(edges_of(planes)) is not None
         )
 
-    def unit_for(self, sprites: Sprites | None) -> list[float] | None:
+    def unit_for(self, sprites: FrameLight | None) -> list[float] | None:
         """The unit of each plane (e-/s) in which no pixel's sum can be too large; None where one is
         too coarse for its panel.
 
@@ -137,7 +137,7 @@ class LightUnits:
         )
         return units if fine else None
 
-    def reach_per_e(self, sprites: Sprites, alone: bool = False) -> float:
+    def reach_per_e(self, sprites: FrameLight, alone: bool = False) -> float:
         """The factor of a star's rate whose logarithm, times `axes_px2`, gives the squared half
         axes of its ellipse (px2).
 
@@ -237,7 +237,7 @@ class StarPasses:
             self._levels.image[..., 0] = floor.read()
             floor.texture.bind_to_image(1, read=True, write=False)  # for all passes of the frame
 
-    def upload(self, sprites: Sprites) -> None:
+    def upload(self, sprites: FrameLight) -> None:
         """Take the sprites that `add_light` and `encode` are about."""
         write(self.sprites, sprites.data)
         self._drawn = len(sprites)
@@ -334,7 +334,7 @@ class ApartPasses(StarPasses):
         self._order = self._ctx.buffer(reserve=4, dynamic=True)
         self.tables += [self._steps.buffer, *([] if self._gains is None else [self._gains])]
 
-    def upload(self, sprites: Sprites) -> None:
+    def upload(self, sprites: FrameLight) -> None:
         """Take the sprites that `add_light` and `encode` are about: those alone come first,
         alike light one after another.
         """

@@ -17,7 +17,7 @@ from hilstar.display.render.encoder import Shares, build_program, splat_program
 from hilstar.display.render.renderer import FIRST_CAPACITY, Renderer
 from hilstar.display.response import Levels
 from hilstar.optics.psf import pixel_shares
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 Profile = Literal["renderer", "erf", "exp erf", "table", "centre"]
 
@@ -86,7 +86,7 @@ class VariantRenderer(Renderer):
             self._splat["footprint_px"] = self.footprint_px
         self._reserve(FIRST_CAPACITY)
 
-    def draw_and_wait(self, sprites: Sprites) -> None:
+    def draw_and_wait(self, sprites: FrameLight) -> None:
         """Draw the linear image of `sprites`, and return when it is done."""
         self.draw(sprites)
         with self._ctx:

@@ -41,7 +41,7 @@ from hilstar.optics.layers.truth import (
 from hilstar.optics.layers.view import STILL, Canvas, View
 from hilstar.optics.paths import Paths
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites, by_channel, join_sprites, shares_by_bv, without_stars
+from hilstar.optics.sprites import FrameLight, by_channel, join_sprites, shares_by_bv, without_stars
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import (
     StarGlass,
@@ -286,7 +286,7 @@ class Simulator(Closing):
             return self.detector.expose_noiseless(mean_e, exposure_s)
         return self.detector.expose(mean_e, exposure_s, rng)
 
-    def _exposed_e(self, sprites: Sprites, stars: Stars, seconds: float) -> FloatArray:
+    def _exposed_e(self, sprites: FrameLight, stars: Stars, seconds: float) -> FloatArray:
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
         channels = [sprites] if self._bayer is None else by_channel(sprites, stars)
         images = (
@@ -295,7 +295,7 @@ class Simulator(Closing):
         )
         return np.multiply(in_pixels(images, self._bayer), seconds, dtype=np.float64)
 
-    def _image(self, sprites: Sprites, stars: Stars, glass: StarGlass | None) -> Float32Array:
+    def _image(self, sprites: FrameLight, stars: Stars, glass: StarGlass | None) -> Float32Array:
         """Electrons per second of each pixel (h, w) of one colour, in memory that the next image
         takes.
         """
@@ -363,13 +363,13 @@ class FaultyExposure:
 
     def __init__(self, view: FaultView, pieces: Sequence[ExposurePiece]) -> None:
         self._view, self.pieces = view, pieces
-        self._seen: list[Sprites] = []
+        self._seen: list[FrameLight] = []
         self._rows: list[tuple[npt.NDArray[np.void], float]] = []
 
     def light_e(
         self,
-        light_of: Callable[[View, FaultLayer], Sprites],
-        exposed_e: Callable[[Sprites, float], FloatArray],
+        light_of: Callable[[View, FaultLayer], FrameLight],
+        exposed_e: Callable[[FrameLight, float], FloatArray],
     ) -> tuple[FloatArray, float]:
         """Electrons (h, w) of the whole exposure, and the seconds of it in which the field is not
         blank.
@@ -391,7 +391,7 @@ class FaultyExposure:
             raise AssertionError("an exposure has a piece")
         return total, open_s
 
-    def _note(self, sprites: Sprites, share: float) -> None:
+    def _note(self, sprites: FrameLight, share: float) -> None:
         self._seen.append(sprites)
         if sprites.added:
             self._rows.append((added_truth(sprites, np.zeros(len(sprites), dtype=bool)), share))
@@ -401,7 +401,7 @@ class FaultyExposure:
         """The faults that are on in it."""
         return tuple(dict.fromkeys(one.fault.name for piece in self.pieces for one in piece.now))
 
-    def sprites(self) -> Sprites:
+    def sprites(self) -> FrameLight:
         """The sprites of the bench's own stars and discs in any of its pieces, end to end."""
         parts = [_own(sprites) for sprites in self._seen]
         whole = join_sprites(parts, parts[0].footprint_px)
@@ -444,7 +444,7 @@ def _merge(into: npt.NDArray[np.void], row: npt.NDArray[np.void]) -> None:
     into["electrons_per_s"] = before + more
 
 
-def _own(sprites: Sprites) -> Sprites:
+def _own(sprites: FrameLight) -> FrameLight:
     """Sprites without light that a fault adds."""
     if not sprites.added:
         return sprites
@@ -474,7 +474,7 @@ def exposure_truth(
     canvas: Canvas,
     view: View,
     stars: Stars,
-    light: Sprites,
+    light: FrameLight,
     mean_e: FloatArray,
     glass: StarGlass | None = None,
 ) -> npt.NDArray[np.void]:

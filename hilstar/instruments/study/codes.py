@@ -42,7 +42,7 @@ from hilstar.display.response import (
     table_response,
 )
 from hilstar.display.temporal import TemporalQuantiser
-from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, pack_sprites
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 
@@ -100,7 +100,7 @@ def response_of(bits: int, way: Way) -> Response:
     return bit_stealing_response((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
 
 
-def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
+def star_field(frame_px: tuple[int, int], footprint_px: int) -> FrameLight:
     """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as
     in the one before.
     """
@@ -111,7 +111,7 @@ def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
     return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, footprint_px)
 
 
-def judged_phases(phases: int) -> tuple[Sprites, int, FloatArray, Judge]:
+def judged_phases(phases: int) -> tuple[FrameLight, int, FloatArray, Judge]:
     """phases^2 stars whose peak is white, the side of a star's tile, px, their image, and its
     judge by the usual tracker.
     """

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import magnitude
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.server.bench.build import load
 from hilstar.server.bench.frame import Bench
 from hilstar.sky.electrons import Optics, fit_table, load_library
@@ -104,7 +104,7 @@ class Isolation:
 
 
 def lone_windows(
-    sprites: Sprites,
+    sprites: FrameLight,
     x_px: FloatArray,
     y_px: FloatArray,
     size_px: tuple[int, int],

@@ -39,7 +39,7 @@ from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.exposure_motion import Motion, smeared_sprites
 from hilstar.optics.frame_motion import Scan
 from hilstar.optics.layers.view import STILL, View
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import scan_of
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
@@ -332,7 +332,7 @@ class TimingSky(Closing):
         self._shown = shown
         self._renderer = Renderer(Target(shown.bench.config.monitor.resolution_px, shown.bench.psf))
 
-    def paths(self, movement: Movement) -> Sprites:
+    def paths(self, movement: Movement) -> FrameLight:
         """Each star's path over the exposure, in monitor pixels."""
         middle_s = self._shown.start_s + self._shown.exposure_s / 2
         motion = Motion(

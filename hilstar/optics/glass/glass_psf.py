@@ -29,7 +29,7 @@ from hilstar.optics.psf import (
     SPLINE_DEGREE,
     SampledPsf,
 )
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 
 # share of any PSF's light that a footprint leaves out: at 10 px it moves a centroid by up to 3e-4
 # px
@@ -481,7 +481,7 @@ class GlassPsf(SampledPsf):
         return found
 
     def image(
-        self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]
+        self, sprites: FrameLight, shares: FloatArray, resolution_px: tuple[int, int]
     ) -> Float32Array:
         """The light of sprites (n,) in all pixels (height, width), electrons per second;
         `shares` as in `of_stars`.

@@ -22,7 +22,7 @@ from hilstar.optics.extended import (
 )
 from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, slowed
 from hilstar.optics.layers.view import Canvas, View
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
 from hilstar.sky.stars import Stars
 
@@ -54,7 +54,7 @@ class BodyLayer:
         self._px_sr, self._px_per_rad = px_rad[0] ** -2, px_rad[1]
         self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
-    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before without what discs hide, and with the light of the discs, which ends
         up farthest first.
         """
@@ -108,7 +108,9 @@ class BodyLayer:
         ]
         return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
 
-    def unhidden(self, light: Sprites, stars: Stars, discs: list[Disc], view: View) -> Sprites:
+    def unhidden(
+        self, light: FrameLight, stars: Stars, discs: list[Disc], view: View
+    ) -> FrameLight:
         """Sprites as seen past `discs` and through their air, without those of the discs
         themselves.
         """

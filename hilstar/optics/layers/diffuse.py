@@ -19,7 +19,7 @@ from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.optics.camera import linear_shares
 from hilstar.optics.extended import LightMap
 from hilstar.optics.layers.view import Canvas, View
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.sky.diffuse import TangentImage
 from hilstar.sky.stars import Stars
 
@@ -60,7 +60,7 @@ class DiffuseLayer:
         self._cell_q = MOVED_PX / (2 * lever_px) if self._faintest else 0.0
         self._kept: tuple[FloatArray, tuple[LightMap, ...]] | None = None
 
-    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before, and the map's; a screen's is that of its attitude's cell, and the
         same objects within a cell.
         """

@@ -38,7 +38,7 @@ from hilstar.optics.layers.layers import StarLayer
 from hilstar.optics.layers.stray_light import gradient_image, map_image, read_map
 from hilstar.optics.layers.view import Canvas
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import AddedLight, Sprites, pack_sprites
+from hilstar.optics.sprites import AddedLight, FrameLight, pack_sprites
 from hilstar.sky.catalog import star_names
 from hilstar.sky.stars import Stars
 
@@ -353,7 +353,7 @@ class FaultView:
             self._glow_kept = fault, share, made
         return made
 
-    def footprints(self, chains: "list[PointChain]") -> list[Sprites]:
+    def footprints(self, chains: "list[PointChain]") -> list[FrameLight]:
         """The sprites of chains. Their lines are numbered from one chain to the next, as stars
         -1, -2 and on.
         """

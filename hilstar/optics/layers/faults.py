@@ -22,7 +22,7 @@ from hilstar.optics.layers.fault_kinds import (
 from hilstar.optics.layers.fault_light import FaultView
 from hilstar.optics.layers.layers import no_light
 from hilstar.optics.layers.view import View
-from hilstar.optics.sprites import AddedLight, Sprites, with_sprites
+from hilstar.optics.sprites import AddedLight, FrameLight, with_sprites
 from hilstar.sky.stars import BODY_CELL_RAD, CellGrid, Stars
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -74,7 +74,7 @@ class FaultLayer:
             view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate
         )
 
-    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before without the stars that faults take away, and with the light that they
         add.
         """
@@ -107,7 +107,7 @@ class FaultLayer:
         return replace(light, extended=(*light.extended, *surfaces)) if surfaces else light
 
 
-def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:
+def _dimmed(sprites: FrameLight, gone: list[tuple[int, float]]) -> FrameLight:
     """Sprites without some stars, or with a share of their light."""
     data, kept = sprites.data, np.ones(len(sprites), dtype=bool)
     for star, left in gone:
@@ -129,7 +129,7 @@ def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:
     )
 
 
-def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
+def _without_discs(sprites: FrameLight, gone: dict[str, float]) -> FrameLight:
     """Sprites whose discs of some bodies are dark, or have a share of their light; what they
     hide stays hidden.
     """

@@ -9,7 +9,7 @@ from hilstar.optics.exposure_motion import MIDDLE_S, smeared_sprites
 from hilstar.optics.frame_motion import swept_sprites
 from hilstar.optics.layers.bodies import BodyLayer
 from hilstar.optics.layers.view import Canvas, Layer, View
-from hilstar.optics.sprites import Candidates, Sprites, join_sprites, make_sprites, with_sprites
+from hilstar.optics.sprites import Candidates, FrameLight, join_sprites, make_sprites, with_sprites
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def sky_layers(
     return tuple(layers)
 
 
-def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) -> Sprites:
+def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) -> FrameLight:
     """The light of a view, layer by layer; `stars` are as seen in it (see `seen_in`)."""
     light = no_light(canvas.psf.footprint_px)
     for layer in layers:
@@ -79,7 +79,7 @@ def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) 
 
 
 @cache
-def no_light(footprint_px: int) -> Sprites:
+def no_light(footprint_px: int) -> FrameLight:
     """The light of no layer."""
     return join_sprites([], footprint_px)
 
@@ -98,7 +98,7 @@ class StarLayer:
     paths: bool = True
     candidates: Candidates = field(default_factory=Candidates, repr=False)
 
-    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before, with a sprite or a chain of sprites for each star on the image."""
         canvas, camera = self.canvas, self.canvas.camera
         if self.paths and view.exposed and view.rate_cam_rad_s is not None:

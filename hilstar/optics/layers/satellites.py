@@ -10,7 +10,7 @@ import numpy as np
 from hilstar.optics.frame_motion import slowed
 from hilstar.optics.layers.bodies import POINT_PX
 from hilstar.optics.layers.view import Canvas, View
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.optics.trails import (
     EVERY,
     Brush,
@@ -45,7 +45,7 @@ class SatelliteLayer:
     canvas: Canvas
     faintest_e_per_s: float = 0.0
 
-    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before and that of the satellites in the image, which are written into the
         arrays of `stars`.
         """
@@ -125,8 +125,8 @@ class SatelliteLayer:
         return Lit(view.begin_s + late_s, rows.hold_s)
 
     def _with_discs(
-        self, light: Sprites, stars: Stars, seen: "Pass", path: TrailView, view: View
-    ) -> Sprites:
+        self, light: FrameLight, stars: Stars, seen: "Pass", path: TrailView, view: View
+    ) -> FrameLight:
         """The light before with satellites as discs, the farthest first, and without what they
         hide.
         """

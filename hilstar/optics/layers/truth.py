@@ -13,7 +13,7 @@ from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.rotation import to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.bodies import disc_stars
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
 from hilstar.sky.stars import Stars
@@ -142,7 +142,7 @@ def with_errors(
     return found
 
 
-def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int | str, ...]:
+def designations(stars: Stars, sprites: FrameLight, which: IntArray) -> tuple[int | str, ...]:
     """The stars of the sprites at positions `which` (n,), each once: HIP numbers, or names
     without one.
     """
@@ -151,14 +151,14 @@ def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int |
     return (*stars.designations(star[star >= 0]), *added)
 
 
-def sprite_names(stars: Stars, sprites: Sprites) -> list[int | str]:
+def sprite_names(stars: Stars, sprites: FrameLight) -> list[int | str]:
     """The star of each sprite: its HIP number, or its name without one."""
     found = iter(stars.designations(sprites.star[sprites.star >= 0]))
     return [sprites.added[-1 - k].name if k < 0 else next(found) for k in sprites.star.tolist()]
 
 
 def sprite_truth(
-    stars: Stars, sprites: Sprites, clipped: IntArray
+    stars: Stars, sprites: FrameLight, clipped: IntArray
 ) -> tuple[npt.NDArray[np.void], IntArray]:
     """Rows of TRUTH_DTYPE for the stars of sprites, all drawn, and their indices (n,); `clipped`
     are positions of sprites.
@@ -183,7 +183,7 @@ def sprite_truth(
     return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
 
 
-def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
+def added_truth(sprites: FrameLight, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
     """Rows of TRUTH_DTYPE for the light that faults add, by the index of each; `over` (n,) says
     which sprites clip.
     """
@@ -231,7 +231,7 @@ class StarInView:
 
 
 def brightest_in_view(
-    light: Sprites, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int
+    light: FrameLight, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int
 ) -> list[StarInView]:
     """The `count` brightest stars and bodies of a view's light that are on the camera's pixels, the
     brightest first.

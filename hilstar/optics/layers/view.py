@@ -12,7 +12,7 @@ from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import Motion
 from hilstar.optics.frame_motion import CameraTurn, Scan
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.sky.stars import Stars
 
 STILL = np.zeros(3)
@@ -131,7 +131,7 @@ class Layer(Protocol):
     `layers.light_of`).
     """
 
-    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+    def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light of the layers before, together with this layer's; `stars` are as seen in the
         view.
         """

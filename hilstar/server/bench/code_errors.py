@@ -21,7 +21,7 @@ from hilstar.display.quantise import Panel
 from hilstar.display.quantisers import Quantisation
 from hilstar.display.response import Response
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.tracker.centroiders import Centroider
 from hilstar.tracker.star_errors import Judge
 
@@ -99,7 +99,7 @@ class PhaseGrid:
     at them.
     """
 
-    sprites: Sprites
+    sprites: FrameLight
     bright: FloatArray
     tile_px: int
     judge: Judge

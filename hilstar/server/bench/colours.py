@@ -28,7 +28,7 @@ from hilstar.optics.extended import shifted
 from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
 from hilstar.optics.layers.truth import with_columns
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import Sprites, extended_by_share, shares_at, shares_of_sprites
+from hilstar.optics.sprites import FrameLight, extended_by_share, shares_at, shares_of_sprites
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
@@ -314,7 +314,7 @@ class Colours:
             added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
         return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
 
-    def driven(self, sprites: Sprites, stars: Stars) -> Sprites:
+    def driven(self, sprites: FrameLight, stars: Stars) -> FrameLight:
         """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
         primaries, by_bv = self._shares_of_all(stars)
         shares = shares_of_sprites(sprites, stars, primaries, by_bv)

@@ -42,7 +42,7 @@ from hilstar.optics.layers.view import STILL, Canvas, Layer, View
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import (
     CLIP_TOLERANCE,
-    Sprites,
+    FrameLight,
     by_primary,
     clipped_sprites,
     without_stars,
@@ -114,7 +114,7 @@ class Drawn:
     """
 
     def __init__(
-        self, renderer: Backend, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()
+        self, renderer: Backend, sprites: FrameLight | None, clipped_hip: tuple[int | str, ...] = ()
     ) -> None:
         self.sprites = sprites
         self.clipped_hip = clipped_hip
@@ -261,26 +261,26 @@ class Bench:
         """`stars` or `shown_stars` as a view has them, bodies among them."""
         return seen_in(view, stars, self.moving)
 
-    def light(self, view: View, faults: FaultLayer | None = None) -> Sprites:
+    def light(self, view: View, faults: FaultLayer | None = None) -> FrameLight:
         """The light of a frame as the monitor can show it, before anything is drawn."""
         return self._light(self.layers, self.shown_stars, view, faults)
 
     def _light(
         self, layers: tuple[Layer, ...], stars: Stars, view: View, faults: FaultLayer | None
-    ) -> Sprites:
+    ) -> FrameLight:
         layers = layers if faults is None else (*layers, faults)
         return self._coloured(
             light_of(self.canvas, layers, seen_in(view, stars, self.moving), view), stars
         )
 
-    def _coloured(self, sprites: Sprites, stars: Stars) -> Sprites:
+    def _coloured(self, sprites: FrameLight, stars: Stars) -> FrameLight:
         return (
             sprites
             if self.spectra is None
             else replace(sprites, spectra=self.spectra(stars, sprites.star))
         )
 
-    def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
+    def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> FrameLight:
         """The sprites of `stars` (by default those bright enough to show) as points, at an
         attitude (unit quaternion).
         """
@@ -326,7 +326,7 @@ class Bench:
                 found += layer.on_image(view)
         return found
 
-    def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
+    def draw_sprites(self, sprites: FrameLight | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
         sprites = self._driven(sprites, self.shown_stars)
         self.renderer.draw(sprites, frame)
@@ -339,7 +339,7 @@ class Bench:
             (*designations(self.shown_stars, sprites, clipped), *sprites.over_white),
         )
 
-    def _driven(self, sprites: Sprites | None, stars: Stars) -> Sprites | None:
+    def _driven(self, sprites: FrameLight | None, stars: Stars) -> FrameLight | None:
         """Sprites with the light of each primary, where those are driven apart; `sprites.star`
         has places among `stars`.
         """
@@ -465,7 +465,7 @@ class Bench:
             return levels
         return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
 
-    def _clipped(self, sprites: Sprites) -> IntArray:
+    def _clipped(self, sprites: FrameLight) -> IntArray:
         """Places of the sprites that are over white: of light as a whole, or of any primary."""
         psf, spectra = self.psf, sprites.spectra
         # as bright as the mean PSF's stars with the same peaks

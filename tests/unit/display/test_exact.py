@@ -13,7 +13,7 @@ from hilstar.display.quantise import Panel, round_levels, shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.sprites import Sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, pack_sprites
 from tests.support.centroiders import family_errors_px
 
 WHITE = 1e6
@@ -31,7 +31,7 @@ OF_ROUND = 0.35
 FLUX_MAG = 0.01
 
 
-def sprites_at(x_px, y_px, electrons_per_s, resolution=FIELD, sigma=SIGMA) -> Sprites:
+def sprites_at(x_px, y_px, electrons_per_s, resolution=FIELD, sigma=SIGMA) -> FrameLight:
     x, y = np.atleast_1d(np.asarray(x_px, float)), np.atleast_1d(np.asarray(y_px, float))
     flux = np.broadcast_to(np.asarray(electrons_per_s, float), x.shape)
     return pack_sprites(x, y, flux, np.arange(len(x)), resolution, GaussianPsf(sigma).footprint_px)

@@ -10,7 +10,7 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.optics.camera import Lens, bounded
-from hilstar.optics.sprites import KEPT_TURN_RAD, Candidates, Sprites, make_sprites
+from hilstar.optics.sprites import KEPT_TURN_RAD, Candidates, FrameLight, make_sprites
 from hilstar.sky.stars import with_bodies
 from tests.support.stars import stars_at
 
@@ -36,7 +36,7 @@ def camera_of(focal_mm: float, lens: Lens | None = None):
     )
 
 
-def assert_same(kept: Sprites, fresh: Sprites) -> None:
+def assert_same(kept: FrameLight, fresh: FrameLight) -> None:
     for name in ("data", "star", "x_px", "y_px"):
         assert getattr(kept, name).tobytes() == getattr(fresh, name).tobytes()
 

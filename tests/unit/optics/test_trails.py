@@ -8,7 +8,7 @@ import pytest
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, pixel_shares
-from hilstar.optics.sprites import Sprites
+from hilstar.optics.sprites import FrameLight
 from hilstar.optics.trails import Brush, Lit, Trails, TrailView, trails, with_trails
 from hilstar.sky.bodies.passes import Cone
 from tests.support.satellites import element_set, satellite_sky
@@ -55,7 +55,7 @@ def is_lit(sky, seconds: int) -> bool:
     return seen is not None and rate_now(seen) > 0
 
 
-def image_of(sprites: Sprites) -> np.ndarray:
+def image_of(sprites: FrameLight) -> np.ndarray:
     """Sprites as exact Gaussians, (h, w)."""
     return gaussians(sprites.x_px, sprites.y_px, sprites.data["electrons_per_s"].astype(np.float64))
 

@@ -28,7 +28,7 @@ from hilstar.instruments.simulate.star_finder import (
 from hilstar.instruments.study.chain.choices import Lit, PanelExposure, lead_ns
 from hilstar.instruments.study.predictors import Movement
 from hilstar.optics.camera import Camera
-from hilstar.optics.sprites import Sprites, make_sprites
+from hilstar.optics.sprites import FrameLight, make_sprites
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.frame import Bench
 from hilstar.sky.stars import Stars
@@ -46,7 +46,7 @@ PATH_STEP_PX = 0.5
 OTHERS_SHARE = 1e-3
 
 
-def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
+def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> FrameLight:
     """Stars, by default all of the bench's, as whole sprites at an attitude."""
     icrs_to_image = bench.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
     return make_sprites(
@@ -76,7 +76,7 @@ def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArr
     return total
 
 
-def linear_light(bench: Bench, sprites: Sprites) -> Lit:
+def linear_light(bench: Bench, sprites: FrameLight) -> Lit:
     """The pixels that a frame's sprites light, and the light of each before any quantisation."""
     image = np.zeros(bench.camera.resolution_px[::-1])
     add_stars(image, sprites, bench.psf, sprites.footprint_px)

@@ -36,7 +36,7 @@ from hilstar.instruments.study.settings import FULL_HD, Table, Value, bench_text
 from hilstar.instruments.study.speed import report, tracker
 from hilstar.instruments.study.sweep import OtherWork
 from hilstar.optics.psf import SQRT2, GaussianPsf
-from hilstar.optics.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
+from hilstar.optics.sprites import Candidates, FrameLight, clipped_sprites, pack_sprites
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.frame import Bench
@@ -51,7 +51,7 @@ Sigma = tuple[float, float]
 _ONE = np.ones(1)
 FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), (8, 8), 4)
 # The linear image, (height, width), of sprites with their sigma, px.
-Draw = Callable[[Sprites, Sigma, tuple[int, int]], Float32Array]
+Draw = Callable[[FrameLight, Sigma, tuple[int, int]], Float32Array]
 FRESH = """
 import re, sys, time
 from pathlib import Path
@@ -169,7 +169,7 @@ def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
     return found, missing
 
 
-def numpy_linear(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+def numpy_linear(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
     """The baseline: separable erf differences and np.add.at. float32 (height, width), electrons
     per second.
     """
@@ -218,7 +218,7 @@ def _add_stars(
 def _make_numba() -> Draw:
     add_stars = import_module("numba").njit(_add_stars)
 
-    def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+    def draw(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
         image = np.zeros(shape, np.float32)
         first = sprites.data["pixel"] - (sprites.footprint_px - 1) // 2
         centre_px = np.stack([sprites.x_px, sprites.y_px])
@@ -234,7 +234,7 @@ def _make_numba() -> Draw:
 def _make_galsim() -> Draw:
     galsim = import_module("galsim")
 
-    def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+    def draw(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
         image = galsim.ImageF(np.zeros(shape, np.float32), xmin=0, ymin=0)
         profile = galsim.Gaussian(sigma=1.0).transform(sigma_px[0], 0, 0, sigma_px[1])
         last = sprites.footprint_px - 1
@@ -258,7 +258,7 @@ def _make_photutils() -> Draw:
     model = import_module("photutils.psf").GaussianPRF
     table = import_module("astropy.table").QTable
 
-    def draw(sprites: Sprites, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
+    def draw(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
         stars = table(
             {
                 "x_0": sprites.x_px,

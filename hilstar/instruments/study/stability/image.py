@@ -28,7 +28,7 @@ from hilstar.display.response import Levels, Response, srgb_response
 from hilstar.instruments.study.codes import AIMS
 from hilstar.instruments.study.stability import FailureCase, Figures
 from hilstar.optics.psf import MAX_CUT, SQRT2, GaussianPsf, pixel_shares
-from hilstar.optics.sprites import Sprites, join_sprites, make_sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 
@@ -67,7 +67,7 @@ ERF_DENOMINATOR = (
     *(-7.37332916720468e-03, -1.42647390514189e-02),
 )
 
-Draw = Callable[[Sprites], FloatArray]
+Draw = Callable[[FrameLight], FloatArray]
 CODES_SEED = 6
 # groups of stars along either side of the image, and the side of each one's part of it
 COUNT, TILE_PX = 8, 22
@@ -92,7 +92,7 @@ def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
     return Target(size_px, GaussianPsf((sigma_px, sigma_px)))
 
 
-def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> Sprites:
+def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> FrameLight:
     """A star of a target's sigma."""
     place = np.array([x_px]), np.array([y_px]), np.array([electrons_per_s])
     return pack_sprites(*place, np.zeros(1, dtype=np.intp), on.resolution_px, on.psf.footprint_px)
@@ -103,7 +103,7 @@ def by_renderer(on: Target) -> Iterator[Draw]:
     """A function that draws the linear image (h, w) of sprites as hilstar does."""
     with Renderer(on) as gl:
 
-        def draw(sprites: Sprites) -> FloatArray:
+        def draw(sprites: FrameLight) -> FloatArray:
             gl.draw(sprites)
             return gl.linear().astype(np.float64)
 
@@ -111,7 +111,7 @@ def by_renderer(on: Target) -> Iterator[Draw]:
 
 
 def _outer(
-    on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], FloatArray]
+    on: Target, sprites: FrameLight, shares: Callable[[FloatArray, float], FloatArray]
 ) -> FloatArray:
     """One star's image from its shares along each axis, by a pixel's offset from it and sigma,
     px.
@@ -121,7 +121,7 @@ def _outer(
     return np.asarray(float(sprites.data["electrons_per_s"][0]) * np.outer(along_y, along_x))
 
 
-def point_sampled(on: Target, sprites: Sprites) -> FloatArray:
+def point_sampled(on: Target, sprites: FrameLight) -> FloatArray:
     """One star with the Gaussian's value at the middle of each pixel, (h, w)."""
     return _outer(
         on,
@@ -130,17 +130,19 @@ def point_sampled(on: Target, sprites: Sprites) -> FloatArray:
     )
 
 
-def half_float(on: Target, sprites: Sprites) -> FloatArray:
+def half_float(on: Target, sprites: FrameLight) -> FloatArray:
     """One star by erf differences in float16, the minimum that GLES calls mediump."""
     return _by_erf(on, sprites, lambda edge: erf(edge).astype(np.float16))
 
 
-def bare_polynomial(on: Target, sprites: Sprites) -> FloatArray:
+def bare_polynomial(on: Target, sprites: FrameLight) -> FloatArray:
     """One star by the shader's polynomial in float32, without its max(difference, 0)."""
     return _by_erf(on, sprites, erf_float32)
 
 
-def _by_erf(on: Target, sprites: Sprites, erf_of: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def _by_erf(
+    on: Target, sprites: FrameLight, erf_of: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
     def shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
         far, near = (erf_of((offset_px + side) / (sigma_px * SQRT2)) for side in (0.5, -0.5))
         return np.asarray((far - near).astype(np.float64) / 2)
@@ -148,7 +150,7 @@ def _by_erf(on: Target, sprites: Sprites, erf_of: Callable[[FloatArray], FloatAr
     return _outer(on, sprites, shares)
 
 
-def nearest_pixel(on: Target, sprites: Sprites) -> FloatArray:
+def nearest_pixel(on: Target, sprites: FrameLight) -> FloatArray:
     """One star with all of its light in the nearest pixel."""
     return _outer(
         on,
@@ -414,7 +416,7 @@ def flux_range() -> FailureCase:
     )
 
 
-def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[Sprites]:
+def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[FrameLight]:
     """Sirius at a given flux in STEPS frames of the demo's camera, which turns until the star
     has moved by PATH_PX.
     """
@@ -491,7 +493,7 @@ def popping_codes() -> FailureCase:
 class CodeScene:
     """Groups of `stars` stars, each group alone in its part of the image, on a panel."""
 
-    sprites: Sprites
+    sprites: FrameLight
     sigma_px: float
     panel: Panel
     stars: int = 1
@@ -539,7 +541,7 @@ def error_steps(codes: Levels, scene: CodeScene) -> float:
 
 def sprites_of(
     x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float
-) -> Sprites:
+) -> FrameLight:
     """Stars at places (n,), so many magnitudes (n,) under the one whose peak is white."""
     sigma = (sigma_px, sigma_px)
     light = WHITE * flux_ratio(under_white_mag) / GaussianPsf(sigma).peak_share

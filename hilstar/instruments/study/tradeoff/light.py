@@ -41,7 +41,7 @@ from hilstar.instruments.study.tradeoff.places import (
     turn_to_image,
 )
 from hilstar.optics.psf import MAX_CUT
-from hilstar.optics.sprites import Sprites, make_sprites, pack_sprites
+from hilstar.optics.sprites import FrameLight, make_sprites, pack_sprites
 from hilstar.server.bench.build import bench_calibration, brightest_peak_e_per_s
 from hilstar.server.bench.cameras import ideal_monitor
 from hilstar.server.bench.config import Monitor, RenderSettings, SkySettings
@@ -307,7 +307,7 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
     for name, variant in splat_variants().items():
         renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SPRITE_PSF), variant))
 
-        def image(sprites: Sprites, renderer: VariantRenderer = renderer) -> FloatArray:
+        def image(sprites: FrameLight, renderer: VariantRenderer = renderer) -> FloatArray:
             renderer.draw(sprites)
             return renderer.linear()[:side, :side].astype(np.float64)
 
@@ -358,7 +358,7 @@ def splat_variants() -> dict[str, SplatVariant]:
     return variants
 
 
-def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[float, float]:
+def _psf_errors(size_px: int, image: Callable[[FrameLight], FloatArray]) -> tuple[float, float]:
     """Worst flux error, mag, and centroid error, px, of stars of a footprint, as `image` draws
     them.
     """
@@ -410,7 +410,7 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-def _codes(renderer: Renderer, field: Sprites, numbers: Iterator[int]) -> None:
+def _codes(renderer: Renderer, field: FrameLight, numbers: Iterator[int]) -> None:
     renderer.draw(field, next(numbers))
     renderer.levels()
 

@@ -38,7 +38,7 @@ from hilstar.instruments.study.sweep import Figure, Trial, Trials
 from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.sprites import SPRITE_DTYPE, Sprites, pack_sprites
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight, pack_sprites
 from hilstar.server.bench.build import bench_stars
 from hilstar.server.bench.cameras import ideal_monitor, tracker_psf
 from hilstar.server.bench.config import BenchConfig, RenderSettings, read_config
@@ -282,7 +282,7 @@ STARS_ACROSS = 16
 ROUNDING_SHARE = 1e-7
 
 
-SpritesOf = Callable[[Stars], Sprites]
+SpritesOf = Callable[[Stars], FrameLight]
 
 
 def smear(stack: ExitStack, quick: bool) -> Trials:
@@ -296,19 +296,19 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant())
     )
 
-    def own(stars: Stars) -> Sprites:
+    def own(stars: Stars) -> FrameLight:
         return smeared_sprites(stars, motion, CAMERA, TRACKER_PSF)
 
-    def gauss(count: int, stars: Stars) -> Sprites:
+    def gauss(count: int, stars: Stars) -> FrameLight:
         nodes, weights = np.polynomial.legendre.leggauss(count)
         return _chain(stars, motion, nodes / 2, weights / 2)
 
-    def evenly(count: int, stars: Stars) -> Sprites:
+    def evenly(count: int, stars: Stars) -> FrameLight:
         return _chain(
             stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count)
         )
 
-    def image(sprites: Sprites) -> FloatArray:
+    def image(sprites: FrameLight) -> FloatArray:
         return linear_image(sprites, CAMERA.resolution_px, TRACKER_PSF, WIDE_PX)
 
     def draw(sprites_of: SpritesOf) -> None:
@@ -367,7 +367,7 @@ def grid_stars(across: int, motion: Motion) -> Stars:
     return make_stars(catalog, vectors, zero, zero + 1)
 
 
-def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> Sprites:
+def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> FrameLight:
     x_px, y_px = _places_px(stars, motion, at)
     light = np.outer(share, stars.electrons_per_s)
     star = np.broadcast_to(np.arange(len(stars)), x_px.shape)

@@ -118,7 +118,11 @@ MAX_AT_S = 1e10
 ADDRESS = re.compile(r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]")
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
-USUAL_ADDRESSES = {"--console": "127.0.0.1:8765", "--scpi": "127.0.0.1:5025"}
+USUAL_ADDRESSES = {
+    "--console": "127.0.0.1:8765",
+    "--scpi": "127.0.0.1:5025",
+    "--camera": "127.0.0.2",
+}
 
 
 def check_files(

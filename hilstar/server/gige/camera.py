@@ -6,19 +6,22 @@ Laws:
    they are many; they are never answered.
 2. Of all who do not control the camera, MAX_OTHERS_PER_S datagrams a second are answered: a crowd
    costs the reading of its datagrams. The controller's are all read.
-3. Whoever computes images never waits for the network: an image that two others wait before is
-   dropped and counted.
+3. Whoever computes images never waits for the network: an image before which WAITING_BLOCKS wait
+   is dropped and counted.
 """
 
 import errno
+import fcntl
 import ipaddress
 import queue
 import select
 import socket
+import struct
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,13 +63,19 @@ LOOK_MS = 20
 # Under a crowd datagrams are read this far apart: to be woken by each costs more than reading it.
 PAUSE_S = 0.005
 CROWD = 4  # datagrams in one look
-WAITING_BLOCKS, KEPT_BLOCKS = 2, 8
+# A machine that stands still for three seconds delays images of 10 Hz, and loses none.
+WAITING_BLOCKS, KEPT_BLOCKS = 32, 8
 # Packets between two pauses: half of what an ordinary socket holds (212 992 bytes, of which the
 # kernel counts twice a packet of 1500).
 BURST = 32
 SPREAD = 0.3  # the share of a period over which an image's packets are spread
 MAX_RESENT_PER_S = 50_000
 WANTED_BUFFER_BYTES = 1 << 22
+LOOPBACK_BROADCAST = "127.255.255.255"
+SIOCGIFADDR, SIOCGIFBRDADDR = 0x8915, 0x8919  # linux/sockios.h
+# struct ifreq (net/if.h): an interface's name, and a sockaddr_in whose address is its bytes 4 to 7
+INTERFACE_REQUEST = struct.Struct("16s24s")
+ADDRESS_PLACE = slice(20, 24)
 TROUBLE = {
     errno.EADDRINUSE: (
         f"its port {PORT} is in use; stop the camera that has it, or write another address, such"
@@ -140,6 +149,7 @@ class GigECamera(Closing):
         self.own_ns: Callable[[int], int] = int
         self._allowed, self._notices, self._clock = allowed, notices, clock
         self._control_socket = _bound(identity.address, PORT)
+        self._searches = _broadcasts(identity.address)
         self._stream_socket = _bound(identity.address, 0)
         self._stream_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WANTED_BUFFER_BYTES)
         self.registers = Registers(identity, settings, describe(identity.model, settings))
@@ -199,22 +209,23 @@ class GigECamera(Closing):
 
     def _serve(self) -> None:
         poll = select.poll()
-        poll.register(self._control_socket, select.POLLIN)
+        for listening in (self._control_socket, *self._searches):
+            poll.register(listening, select.POLLIN)
         while not self._stop.is_set():
             poll.poll(LOOK_MS)
-            count = self._read()
+            count = sum(map(self._read, (self._control_socket, *self._searches)))
             self.channel.tick(self._clock.now_ns())
             self._do()
             if count > CROWD:
                 self._stop.wait(PAUSE_S)
 
-    def _read(self) -> int:
-        """Answer the datagrams that wait; how many there were."""
+    def _read(self, listening: socket.socket) -> int:
+        """Answer the datagrams that wait at a socket; how many there were."""
         count = strangers = 0
         host = ""
         while count < MAX_TAKEN:
             try:
-                data, peer = self._control_socket.recvfrom(MAX_DATAGRAM_BYTES)
+                data, peer = listening.recvfrom(MAX_DATAGRAM_BYTES)
             except OSError:
                 break
             count += 1
@@ -224,7 +235,7 @@ class GigECamera(Closing):
             elif peer == self.channel.controller or self._others.take():
                 self._answer(data, peer)
         if strangers:
-            self._refuse(strangers, host)
+            self._refuse(strangers, host, directed=listening is self._control_socket)
         return count
 
     def _answer(self, data: bytes, peer: Peer) -> None:
@@ -235,15 +246,18 @@ class GigECamera(Closing):
             _send(self._control_socket, [answer], peer)
         self._do()
 
-    def _refuse(self, strangers: int, host: str) -> None:
-        self._notices.begin(
-            "camera-sender-not-allowed",
-            f"datagrams to the camera from {host} are dropped: it is not in [attitude] allow;"
-            " further ones are only counted",
-        )
+    def _refuse(self, strangers: int, host: str, *, directed: bool) -> None:
+        # A search goes to every camera, and says nothing about this one.
+        if directed:
+            self._notices.begin(
+                "camera-sender-not-allowed",
+                f"datagrams to the camera from {host} are dropped: --allow does not name it;"
+                " further ones are only counted",
+            )
         if strangers > CROWD and not self._filtered:
             self._filtered = True
-            keep_only_networks(self._control_socket, self._allowed.networks)
+            for listening in (self._control_socket, *self._searches):
+                keep_only_networks(listening, self._allowed.networks)
 
     def _do(self) -> None:
         """Do what the control channel's events ask for."""
@@ -326,8 +340,8 @@ class GigECamera(Closing):
         self._waiting.put(None)
         for thread in self._threads:
             thread.join()
-        self._control_socket.close()
-        self._stream_socket.close()
+        for made in (self._control_socket, self._stream_socket, *self._searches):
+            made.close()
 
 
 def _bound(address: ipaddress.IPv4Address, port: int) -> socket.socket:
@@ -340,6 +354,39 @@ def _bound(address: ipaddress.IPv4Address, port: int) -> socket.socket:
         raise InputError(f"--camera {address}: {trouble}") from error
     made.setblocking(False)
     return made
+
+
+def _broadcasts(address: ipaddress.IPv4Address) -> list[socket.socket]:
+    """Sockets for a client's search, which it sends to all: to the network of the camera's
+    interface, and to no network in particular. Several cameras of a machine share them.
+    """
+    made = []
+    for broadcast in {_broadcast_of(address), "255.255.255.255"}:
+        listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((broadcast, PORT))
+        except OSError:  # a client then asks at the camera's own address
+            listening.close()
+            continue
+        listening.setblocking(False)
+        made.append(listening)
+    return made
+
+
+def _broadcast_of(address: ipaddress.IPv4Address) -> str:
+    """The broadcast address of the interface that has an address."""
+    if address.is_loopback:
+        return LOOPBACK_BROADCAST
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            request = INTERFACE_REQUEST.pack(name.encode(), b"")
+            with suppress(OSError):
+                own = fcntl.ioctl(asking, SIOCGIFADDR, request)
+                if own[ADDRESS_PLACE] == address.packed:
+                    told = fcntl.ioctl(asking, SIOCGIFBRDADDR, request)
+                    return str(ipaddress.IPv4Address(told[ADDRESS_PLACE]))
+    return str(address)
 
 
 def _send(sending: socket.socket, parts: list[bytes | memoryview], peer: Peer) -> None:

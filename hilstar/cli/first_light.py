@@ -14,7 +14,14 @@ from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
 from hilstar.basics.reading import exists
 from hilstar.basics.resources import resource_path
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files, parse_diode
+from hilstar.cli.options import (
+    MAX_SEED,
+    BenchFile,
+    Json,
+    check_files,
+    frames_of,
+    parse_diode,
+)
 from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
 from hilstar.server.console.terminal import print_found, say
 
@@ -24,6 +31,7 @@ if TYPE_CHECKING:
     from hilstar.server.console.listener import PageListener
 
 PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
+MAX_FRAMES = 1000  # images that verify averages
 EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 
 
@@ -98,15 +106,14 @@ def first_light(
         ),
     ] = None,
     frames: Annotated[
-        int | None,
+        list[str] | None,
         Option(
-            metavar="N",
+            metavar="N|ENDPOINT",
             help=(
-                "Images of each field of stars that verify averages. [as many as their noise asks"
-                " for, 25 at most; by hand 1]"
+                "Images of each field of stars that verify averages [as many as their noise asks"
+                " for, 25 at most; by hand 1]. With an endpoint such as tcp://127.0.0.1:5570 it"
+                " hands each pattern on to who watches there; may be given once for each."
             ),
-            min=1,
-            max=1000,
         ),
     ] = None,
     again: Annotated[
@@ -147,6 +154,9 @@ def first_light(
     file = read_bench_file(bench_file)
     virtual = virtual_truth(virtual)
     check_files([virtual, dark], [], file)
+    count, endpoint = frames_of(frames, heads=False)
+    if count is not None and count > MAX_FRAMES:
+        raise InputError(f"--frames {count}: write at most {MAX_FRAMES}")
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     if by_hand and warm_up:
@@ -160,6 +170,7 @@ def first_light(
     with (
         page_listener(console, control, token, console_name) as listener,
         closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
+        _handed_on(endpoint, source),
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -173,7 +184,7 @@ def first_light(
             readings,
             watch,
             watched_s=watched_s,
-            frames=frames or 0,
+            frames=count or 0,
             progress=say,
         )
         code = session.run(frozenset(again or []), tell)
@@ -211,6 +222,21 @@ def _shown(
         yield tell, feed.show
 
 
+@contextmanager
+def _handed_on(endpoint: str | None, source: "ImageSource") -> Iterator[None]:
+    """The session's patterns handed on at an endpoint, if there is one. Raises InputError."""
+    if endpoint is None:
+        yield
+        return
+    from hilstar.attitude.wire.shown_frames import FrameSender
+    from hilstar.instruments.calibrate.first_light.image_sources import PatternFrames
+
+    with FrameSender(endpoint) as sender:
+        source.hand_on(PatternFrames(sender))
+        say(f"frames: {sender.endpoint}")
+        yield
+
+
 def virtual_truth(path: Path | None) -> Path | None:
     """The file of --virtual; the example that comes with hilstar is found by its name."""
     if path is not None and path.name == EXAMPLE_TRUTH and not exists(path):
@@ -229,12 +255,14 @@ def image_source(
     """The source of images. Raises InputError for options that exclude each other."""
     from hilstar.instruments.calibrate.first_light.image_sources import (
         ByHand,
+        GrabCamera,
         GrabCommand,
         SerialDiode,
         VirtualBench,
     )
     from hilstar.instruments.calibrate.geometric.observed import read_image
     from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.genicam.camera import PREFIX
 
     if virtual is not None:
         for name, given in (("grab", grab), ("dark", dark), ("diode", diode)):
@@ -246,4 +274,8 @@ def image_source(
     if dark is not None:
         read_image(dark, file.config.tracker.resolution_px)
     recorder = None if diode is None else SerialDiode(*parse_diode(diode))
-    return ByHand(dark, recorder) if grab is None else GrabCommand(grab, dark, recorder)
+    if grab is None:
+        return ByHand(dark, recorder)
+    if grab.startswith(PREFIX):
+        return GrabCamera(file, grab.removeprefix(PREFIX), dark, recorder)
+    return GrabCommand(grab, dark, recorder)

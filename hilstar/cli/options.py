@@ -118,7 +118,11 @@ MAX_AT_S = 1e10
 ADDRESS = re.compile(r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]")
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
-USUAL_ADDRESSES = {"--console": "127.0.0.1:8765", "--scpi": "127.0.0.1:5025"}
+USUAL_ADDRESSES = {
+    "--console": "127.0.0.1:8765",
+    "--scpi": "127.0.0.1:5025",
+    "--camera": "127.0.0.2",
+}
 
 
 def check_files(
@@ -158,6 +162,26 @@ def with_values(words: list[str]) -> list[str]:
         if word in USUAL_ADDRESSES and not ADDRESS.fullmatch(following):
             complete.append(USUAL_ADDRESSES[word])
     return complete
+
+
+def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str | None]:
+    """What --frames asks for: how many frames, and where they are sent to. Raises InputError."""
+    form = (
+        "write a number of frames, or an endpoint such as tcp://127.0.0.1:5570; both may be given"
+    )
+    counts = [text for text in asked or () if "://" not in text]
+    endpoints = [text for text in asked or () if "://" in text]
+    for kind in (counts, endpoints):
+        if len(kind) > 1:
+            raise InputError(f"--frames {kind[0]} and --frames {kind[1]}: {form}")
+    if counts and not (counts[0].isdecimal() and int(counts[0]) > 0):
+        raise InputError(f"--frames {counts[0]}: {form}")
+    if endpoints and heads:
+        raise InputError(
+            f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or"
+            " leave it out"
+        )
+    return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
 
 
 def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:

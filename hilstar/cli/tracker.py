@@ -1,5 +1,6 @@
 """hilstar tracker: the virtual tracker as a process of its own, before a display that runs."""
 
+import dataclasses
 import os
 import re
 import threading
@@ -18,8 +19,14 @@ from hilstar.cli import options
 from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from hilstar.attitude.wire.shown_frames import FrameWatch
+    from hilstar.instruments.simulate.answer_link import AnswerLink
     from hilstar.instruments.simulate.live_exposure import LiveTracker, Solve
     from hilstar.server.answers.answer import Answer
+    from hilstar.server.bench.bench_file import BenchFile
+    from hilstar.server.gige.camera import GigECamera
 
 SOLVER_S = 10.0  # for a command
 NICE = 5
@@ -36,12 +43,32 @@ def tracker(
         Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from."),
     ],
     answer: Annotated[
-        str,
+        str | None,
         Option(
             metavar="TARGET",
-            help="tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or serial:/dev/ttyX@BAUD.",
+            help=(
+                "Where answers go: tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or"
+                " serial:/dev/ttyX@BAUD. Needed without --camera."
+            ),
         ),
-    ],
+    ] = None,
+    camera: Annotated[
+        str | None,
+        Option(
+            metavar="[ADDRESS]",
+            help=(
+                "Be a GigE Vision camera at an address of this machine, 127.0.0.2 by default: its"
+                " client gets the exposures."
+            ),
+        ),
+    ] = None,
+    allow: Annotated[
+        list[str] | None,
+        Option(
+            metavar="ADDRESS",
+            help="Who may use the camera; this machine alone by default. May be repeated.",
+        ),
+    ] = None,
     rate: Annotated[
         float | None,
         Option(
@@ -129,13 +156,15 @@ def tracker(
     import numpy as np
 
     from hilstar.attitude.wire.shown_frames import FrameWatch
-    from hilstar.instruments.simulate.answer_link import FORMATS, AnswerLink
+    from hilstar.instruments.simulate.answer_link import FORMATS
     from hilstar.instruments.simulate.live_exposure import LiveTracker
     from hilstar.instruments.simulate.tracker_process import Planted, TrackerProcess
     from hilstar.server.bench.bench_file import read_bench_file
 
     if form not in FORMATS:
         raise InputError(f"--format {form}: write {' or '.join(FORMATS)}")
+    if answer is None and camera is None:
+        raise InputError("nothing is to be given: write --answer TARGET, --camera, or both")
     file = read_bench_file(bench_file)
     options.check_files([], [record], file)
     bias_arcsec = options.parse_numbers(bias, 3, "--bias", "X,Y,Z in arcsec")
@@ -151,31 +180,100 @@ def tracker(
     with (
         FrameWatch(watch) as frames,
         LiveTracker(file, noise) as live,
-        AnswerLink(answer, form, connect, garbage if babble else None) as link,
+        answer_link(answer, form, connect, garbage if babble else None) as link,
+        open_camera(camera, allow or [], file, rate_hz) as gige,
         recorded(record) as row,
         stop_on_signal(stop),
     ):
-        live.lost_in_space = solver_of(solver, live)
-        say(
-            f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form},"
-            f" to {link.endpoint}"
-        )
-        process = TrackerProcess(live, frames, errors, rate_hz, chance)
+        outlets = []
+        if link is not None:
+            live.lost_in_space = solver_of(solver, live)
+            outlets.append(f"answers {rate_hz:g} Hz, {form}, to {link.endpoint}")
+        if gige is not None:
+            outlets.append(f"a GigE Vision camera at {camera}")
+        watching = f"{frames.verb.replace('a sender', 'frames')} {watch}"
+        say("; ".join([watching, *outlets]))
+        process = TrackerProcess(live, frames, errors, rate_hz, chance, gige)
 
-        def send(said: "Answer") -> None:
-            link.send(said)
-            row(said)
+        def send(answered: "Answer") -> None:
+            if link is not None:
+                link.send(answered)
+            row(answered)
 
-        process.run(send, stop, float("inf") if duration is None else duration)
-        told = process.tally.summary() | {
-            "frames": {
-                "received": live.frames.received,
-                "missing": live.frames.missing,
-                "refused": frames.refused,
-            },
-            "link": {"endpoint": link.endpoint, "sent": link.sent, "babbled": link.babbled},
-        }
+        seconds = float("inf") if duration is None else duration
+        process.run(None if link is None else send, stop, seconds)
+        told = process.tally.summary() | counts_of(live, frames, link, gige)
     tell(told, as_json)
+
+
+def counts_of(
+    live: "LiveTracker",
+    frames: "FrameWatch",
+    link: "AnswerLink | None",
+    gige: "GigECamera | None",
+) -> dict[str, Any]:
+    """What came and what was sent, as `--json` has it."""
+    counts: dict[str, Any] = {
+        "frames": {
+            "received": live.frames.received,
+            "missing": live.frames.missing,
+            "refused": frames.refused,
+        }
+    }
+    if link is not None:
+        counts["link"] = {
+            "endpoint": link.endpoint,
+            "sent": link.sent,
+            "babbled": link.babbled,
+        }
+    if gige is not None:
+        sent, heard = gige.counts, gige.channel.counts
+        counts["camera"] = dataclasses.asdict(sent) | dataclasses.asdict(heard)
+    return counts
+
+
+@contextmanager
+def answer_link(
+    target: str | None, form: str, connect: bool, babbler: "np.random.Generator | None"
+) -> Iterator["AnswerLink | None"]:
+    """The link of answers, None without a target. Raises InputError."""
+    from hilstar.instruments.simulate.answer_link import AnswerLink
+
+    if target is None:
+        yield None
+        return
+    with AnswerLink(target, form, connect, babbler) as link:
+        yield link
+
+
+@contextmanager
+def open_camera(
+    address: str | None, allow: list[str], file: "BenchFile", rate_hz: float
+) -> Iterator["GigECamera | None"]:
+    """The tracker as a camera at an address, None without one. Raises InputError."""
+    if address is None:
+        yield None
+        return
+    from hilstar import __version__
+    from hilstar.attitude.wire.endpoint import AllowedSenders
+    from hilstar.basics.notices import Notices
+    from hilstar.server.gige.camera import GigECamera, camera_address
+    from hilstar.server.gige.registers import CameraIdentity, CameraSettings
+
+    place = camera_address(address)
+    allowed = AllowedSenders(allow or file.config.attitude.allow)
+    if not allowed and not place.is_loopback:
+        raise InputError(
+            f"--camera {address} is open to other machines, and nothing says which may use it;"
+            " write --allow ADDRESS, such as --allow 192.168.1.20"
+        )
+    tracker = file.config.tracker
+    width_px, height_px = tracker.resolution_px
+    bits = tracker.detector.bits
+    settings = CameraSettings(width_px, height_px, bits, tracker.exposure_s, rate_hz)
+    identity = CameraIdentity(place, "virtual tracker", __version__, file.sha256[:15])
+    with GigECamera(identity, settings, allowed, Notices()) as gige:
+        yield gige
 
 
 def stand_back() -> None:

@@ -37,6 +37,7 @@ from hilstar.server.bench.build import bench_calibration, bench_optics
 from hilstar.server.bench.cameras import FieldsOfView, bench_camera, fields_of_view
 from hilstar.server.bench.measured_on import MonitorCheck, check_monitor
 from hilstar.server.bench.star_size import StarSize, star_size
+from hilstar.server.genicam.camera import INSTALL, has_aravis, list_cameras
 from hilstar.sky.catalog import load_catalog
 
 USUAL_BITS = 8
@@ -110,6 +111,7 @@ def examine() -> Examination:
         _gpus(),
         replace(shown, ok=shown.ok and shown.detail != NOT_THERE, required=False),
         Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False),
+        _cameras(),
     ]
     outputs = [
         OutputReport(
@@ -118,6 +120,17 @@ def examine() -> Examination:
         for state in lit_outputs()
     ]
     return Examination(all(check.ok for check in checks if check.required), checks, outputs)
+
+
+def _cameras() -> Check:
+    """The cameras that `--grab genicam:` can open."""
+    if not has_aravis():
+        return Check("cameras", ok=False, detail=f"not looked for: {INSTALL}", required=False)
+    lines = [
+        f"{camera['vendor']}-{camera['model']}, serial {camera['serial']}, at {camera['address']}"
+        for camera in list_cameras()
+    ]
+    return Check("cameras", bool(lines), "; ".join(lines) or "no camera", required=False)
 
 
 @dataclass(frozen=True, slots=True)

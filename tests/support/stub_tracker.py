@@ -4,7 +4,8 @@ over a serial line.
 `python -m tests.support.stub_tracker '{"port": 5560, "line": 5}'`: the keys are those of `Stub`.
 The tracker reports what was commanded in the middle of each exposure, with errors that are planted
 here, one JSON object a line. Its `mode` is the host's clock just before it writes, ns. It ends when
-its standard input does, and then prints which answers were wild.
+its standard input does, and then prints which answers were wild, and before which it was itself held
+up for so long that the display had to guess.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import select
 import sys
 import time
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,8 @@ from tests.support.senders import ORION, packet
 
 ARCSEC_PER_RAD = 180 * 3600 / np.pi
 SENT_EACH_S = 0.02
+# A display that is told nothing for longer predicts a swing, and shows another sky than this one.
+STARVED_S, BEFORE_S = 2.5 * SENT_EACH_S, 0.3
 
 
 @dataclass(frozen=True)
@@ -89,22 +93,28 @@ def main() -> None:
     sender.connect(f"tcp://127.0.0.1:{stub.port}")
     begun_s = time.monotonic()
     sent, answered, wild = 0, 0, []
+    sent_s: deque[float] = deque([begun_s], maxlen=round(1 / SENT_EACH_S))
+    starved = []
     while not select.select([sys.stdin], [], [], 0)[0]:
         now_s = time.monotonic()
         if now_s >= begun_s + sent * SENT_EACH_S:
             sender.send(packet(sent, round(now_s * 1e9), tuple(stub.q(now_s)), None))
             sent += 1
+            sent_s.append(time.monotonic())
         middle_s = begun_s + 0.5 + answered / stub.answer_hz
         if now_s >= middle_s + stub.latency_s:
             text, is_wild = stub.answer(answered, middle_s, begun_s, rng)
             if not stub.silent_s[0] <= now_s - begun_s < stub.silent_s[1]:
                 os.write(stub.line, text.encode())
                 wild += [answered] if is_wild else []
+                times_s = [at_s for at_s in sent_s if at_s > middle_s - BEFORE_S]
+                if max(np.diff([middle_s - BEFORE_S, *times_s]), default=0.0) > STARVED_S:
+                    starved.append(answered)
             answered += 1
         if stub.babble:
             os.write(stub.line, rng.bytes(64))
         time.sleep(0.001)
-    print(json.dumps({"answered": answered, "wild": wild}))
+    print(json.dumps({"answered": answered, "wild": wild, "starved": starved}))
 
 
 if __name__ == "__main__":

@@ -98,6 +98,22 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
     return b"".join([*code, INSTRUCTION.pack(RETURN, 0, 0, NOTHING)])
 
 
+def keep_only_networks(receiving: socket.socket, networks: Sequence[Network]) -> bool:
+    """Have the kernel drop datagrams from other addresses at a socket; False where it does not
+    take the filter.
+    """
+    code = filter_program(networks, 6 if receiving.family == socket.AF_INET6 else 4)
+    count = len(code) // INSTRUCTION.size
+    if count > MAX_INSTRUCTIONS:
+        return False
+    program = ctypes.create_string_buffer(code, len(code))
+    with contextlib.suppress(OSError):
+        pointer = struct.pack("@HP", count, ctypes.addressof(program))
+        receiving.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, pointer)
+        return True
+    return False
+
+
 class KernelStamps:
     """Has the kernel stamp arrivals at `receiving`; where it cannot, the time of reading counts.
 
@@ -228,16 +244,7 @@ class Datagrams:
         """Have the kernel drop datagrams from other addresses; False where it does not take the
         filter.
         """
-        code = filter_program(networks, 6 if self._socket.family == socket.AF_INET6 else 4)
-        count = len(code) // INSTRUCTION.size
-        if count > MAX_INSTRUCTIONS:
-            return False
-        kept = ctypes.create_string_buffer(code, len(code))
-        with contextlib.suppress(OSError):
-            pointer = struct.pack("@HP", count, ctypes.addressof(kept))
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, pointer)
-            return True
-        return False
+        return keep_only_networks(self._socket, networks)
 
     def dropped(self) -> int:
         """How many datagrams the kernel dropped so far: by that filter, or for want of room."""

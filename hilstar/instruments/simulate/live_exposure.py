@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -197,6 +198,7 @@ class LiveTracker(Closing):
         background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
         glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
         self._under_e = glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
+        self._bench_exposure_s, self._gain_db = self.exposure_s, 0.0
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
@@ -236,17 +238,27 @@ class LiveTracker(Closing):
             )
         self.frames.add(frame)
 
+    def adjust(self, exposure_s: float, gain_db: float) -> None:
+        """Expose for `exposure_s`, with a gain over the bench file's, as a camera's client asks."""
+        self.exposure_s = exposure_s
+        if gain_db == self._gain_db:
+            return
+        tracker = self.config.tracker
+        gain_e_per_dn = tracker.detector.gain_e_per_dn / 10 ** (gain_db / 20)
+        settings = msgspec.structs.replace(tracker.detector, gain_e_per_dn=gain_e_per_dn)
+        self._detector = Detector(settings, tracker.resolution_px, tracker.pixel_pitch_um)
+        self._gain_db = gain_db
+
     def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
         """The DN of an exposure."""
         lights = (LitLight(exposed.lit, light) for light in exposed.light_e_per_s.T)
         images = self._optics.images_e_per_s(lights, self._primaries)
         light = self._colours.shown(images) * self.exposure_s
-        light += self._under_e
+        light += self._under_e * (self.exposure_s / self._bench_exposure_s)
         return self._detector.expose(light, self.exposure_s, self._rng)
 
-    def solve(self, exposed: Exposed) -> Solved:
-        """The attitude of an exposure."""
-        dn = self.expose(exposed)
+    def solve(self, exposed: Exposed, dn: npt.NDArray[np.uint16]) -> Solved:
+        """The attitude of an exposure, whose image is `dn`."""
         expected = self._expected(exposed)
         found = self._found(dn, exposed, expected)
         settings = self.config.tracker.detector

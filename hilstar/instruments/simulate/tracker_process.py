@@ -30,8 +30,14 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.running_statistics import RunningStatistics
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
+from hilstar.instruments.simulate.exposure_times import (
+    CameraExposures,
+    ExposureTimes,
+    FreeExposures,
+)
 from hilstar.instruments.simulate.live_exposure import LOST, TRACKING, LiveTracker, Solved
 from hilstar.server.answers.answer import Answer
+from hilstar.server.gige.camera import GigECamera
 
 GRACE_NS = 50 * NS_PER_MS  # three refreshes at 60 Hz
 SLICE_MS = 20
@@ -163,51 +169,75 @@ class TrackerProcess:
         planted: Planted,
         rate_hz: float,
         rng: np.random.Generator,
+        camera: GigECamera | None = None,
     ) -> None:
         self.tally = TrackerTally()
+        self._camera = camera
         self._tracker, self._watch, self._planted = tracker, watch, planted
         self._period_ns = round(NS_PER_S / rate_hz)
-        self._exposure_ns = round(tracker.exposure_s * NS_PER_S)
         self._errors = PlantedErrors(planted, tracker.camera.focal_length_px, rng)
         self._waiting: list[tuple[int, int, Answer]] = []  # when it is due, ns, and its number
         self._host: HostClock = HOST_CLOCK
+        self._begun_ns = self._host.now_ns()
+        self._clock = OwnClock(planted, self._begun_ns)
 
-    def run(self, send: Send, stop: threading.Event, duration_s: float = math.inf) -> None:
-        """Answer until stopped, or for a duration from the first frame on. Raises InputError for
-        frames of another display.
+    def run(self, send: Send | None, stop: threading.Event, duration_s: float = math.inf) -> None:
+        """Expose, and answer where there is a `send`, until stopped, or for a duration from the
+        first frame on. Raises InputError for frames of another display.
         """
         while not self._tracker.frames.received and not stop.is_set():
             self._take(SLICE_MS)
-        begun_ns = self._tracker.frames.newest_ns
-        clock = OwnClock(self._planted, begun_ns)
-        first_ns, number = clock.of_host(begun_ns), 0
+        begun_ns = self._begun_ns = self._tracker.frames.newest_ns
+        clock = self._clock = OwnClock(self._planted, begun_ns)
+        end_ns = begun_ns + duration_s * NS_PER_S
+        if self._camera is None:
+            times: ExposureTimes = FreeExposures(clock, begun_ns, self._period_ns)
+        else:
+            self._camera.own_ns = clock.of_host
+            times = CameraExposures(clock, begun_ns, self._camera, always=send is not None)
         while not stop.is_set():
-            begin_ns = clock.to_host(first_ns + number * self._period_ns)
-            if begin_ns - begun_ns >= duration_s * NS_PER_S:
+            begin_ns = times.next_ns()
+            if (self._host.now_ns() if begin_ns is None else begin_ns) >= end_ns:
                 break
-            end_ns = begin_ns + self._exposure_ns
-            self._await(end_ns, send, stop)
-            exposed = self._tracker.frames.exposed(begin_ns, end_ns)
-            if exposed is None or stop.is_set():
-                number += 1
+            if begin_ns is None:
+                self._take(SLICE_MS)
+                self._put(send)
                 continue
-            cpu_s = time.process_time()
-            solved = self._tracker.solve(exposed)
-            self.tally.cpu_ms.add(1e3 * (time.process_time() - cpu_s))
-            self._report(solved, clock, (exposed.middle_ns - begun_ns) / NS_PER_S)
-            self._put(send)
-            number += 1
-            behind = (self._host.now_ns() - end_ns) // self._period_ns - 1
-            acquired = solved.mode == LOST and solved.identified is not None
-            # the exposure after it tells the rate, however long the solver took
-            if behind > 0 and not acquired:
-                self.tally.passed_over += behind
-                number += behind
+            self._expose(begin_ns, send, stop, times)
         while self._waiting and not stop.is_set():
             self._host.wait_until(self._waiting[0][0], stop)
             self._put(send)
 
-    def _await(self, end_ns: int, send: Send, stop: threading.Event) -> None:
+    def _expose(
+        self, begin_ns: int, send: Send | None, stop: threading.Event, times: ExposureTimes
+    ) -> None:
+        """One exposure: its image to the camera, its answer to `send`."""
+        tracker, camera = self._tracker, self._camera
+        if camera is not None:
+            tracker.adjust(camera.settings.exposure_s, camera.settings.gain_db)
+        end_ns = begin_ns + round(tracker.exposure_s * NS_PER_S)
+        self._await(end_ns, send, stop)
+        exposed = tracker.frames.exposed(begin_ns, end_ns)
+        if exposed is None or stop.is_set():
+            times.done()
+            return
+        cpu_s = time.process_time()
+        dn = tracker.expose(exposed)
+        if camera is not None:
+            camera.take(dn, begin_ns)
+        solved = None if send is None else tracker.solve(exposed, dn)
+        self.tally.cpu_ms.add(1e3 * (time.process_time() - cpu_s))
+        times.done()
+        acquired = False
+        if solved is not None:
+            self._report(solved)
+            self._put(send)
+            acquired = solved.mode == LOST and solved.identified is not None
+        # the exposure after one that was acquired tells the rate, however long the solver took
+        if not acquired:
+            self.tally.passed_over += times.pass_over(end_ns, self._host.now_ns())
+
+    def _await(self, end_ns: int, send: Send | None, stop: threading.Event) -> None:
         """Take frames until one was lit after an exposure's end, or none comes any more."""
         while (
             not stop.is_set()
@@ -222,9 +252,10 @@ class TrackerProcess:
         for frame in self._watch.frames(timeout_ms):
             self._tracker.take(frame)
 
-    def _report(self, solved: Solved, clock: OwnClock, since_s: float) -> None:
+    def _report(self, solved: Solved) -> None:
         tally, q, wrong = self.tally, None, False
         middle_ns = solved.exposed.middle_ns
+        since_s = (middle_ns - self._begun_ns) / NS_PER_S
         tally.modes[solved.mode] += 1
         tally.stars.add(0 if solved.identified is None else len(solved.identified.star))
         if solved.identified is not None:
@@ -243,7 +274,7 @@ class TrackerProcess:
         answer = Answer(
             host_ns=middle_ns,
             raw=b"",
-            t_ns=clock.of_host(middle_ns),
+            t_ns=self._clock.of_host(middle_ns),
             q_icrs_to_cam=q,
             rate_cam_rad_s=(
                 self._tracker.rate_cam_rad_s()
@@ -263,7 +294,9 @@ class TrackerProcess:
             (middle_ns + round(self._planted.latency_s * NS_PER_S), tally.answers, answer),
         )
 
-    def _put(self, send: Send) -> None:
+    def _put(self, send: Send | None) -> None:
+        if send is None:
+            return
         while self._waiting and self._waiting[0][0] <= self._host.now_ns():
             answer = heapq.heappop(self._waiting)[-1]
             send(answer)

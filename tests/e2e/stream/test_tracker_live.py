@@ -87,6 +87,7 @@ def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_p
     assert len(records) == summary["answers"]["answers"] >= ANSWERS
     assert summary["answers"]["silent"]
     wrong = [number for number, record in enumerate(records) if record.verdict == "wrong"]
+    starved = planted["starved"]
     assert summary["answers"]["wrong"] == len(wrong) == len(planted["wild"]) > 0
     assert {record.verdict for record in records} <= {"right", "wrong", "unpaired"}
     assessed = run_hilstar_here(
@@ -97,7 +98,11 @@ def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_p
     # Four sigmas of the mean of so many answers, and of 2 ms of a clock at 1 deg/s.
     sigma = 4 * np.array(Stub(0, 0).noise_arcsec) / np.sqrt(len(records)) + 7
     assert (np.abs(np.array(found["bias_arcsec"]) - Stub(0, 0).bias_arcsec) < sigma).all()
-    assert [each["row"] for each in found["wrong"]] == [number + 1 for number in wrong]
+    # The stub reports what it commands, and not what was lit: a sender that a busy machine held up
+    # had another sky shown.
+    rows = {each["row"] for each in found["wrong"]}
+    planted_rows, starved_rows = ({number + 1 for number in kind} for kind in (wrong, starved))
+    assert planted_rows <= rows <= planted_rows | starved_rows
 
 
 def follow(page: Any, count: int) -> tuple[list[float], dict[str, Any]]:

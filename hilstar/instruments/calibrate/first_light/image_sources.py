@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
+from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.basics.files import written
@@ -49,6 +50,7 @@ from hilstar.server.bench.build import calibration_source, open_bench, orientati
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.frame_files import png_of, write_codes_png
 from hilstar.server.bench.measured_on import check_monitor
+from hilstar.server.genicam.camera import PREFIX, CameraError, GenicamCamera, chosen_format
 from hilstar.server.screen.gate import Timing, pass_gate
 from hilstar.server.screen.screen import Screen, marker_light
 from hilstar.tracker.detector import Detector
@@ -162,6 +164,10 @@ class ImageSource:
         """Go on showing a pattern for `seconds`."""
         time.sleep(seconds)
 
+    def hand_on(self, frames: "PatternFrames") -> None:
+        """Hand the patterns to watchers, too. Raises InputError without a display."""
+        raise InputError("--frames: this session shows nothing here; leave --frames out")
+
     def close(self) -> None:
         """Free the display."""
 
@@ -257,12 +263,45 @@ def _presenter(
     return Presenter(texture, view), texture.release
 
 
+class PatternFrames:
+    """Hands the patterns that are shown to watchers, as a run hands on its frames."""
+
+    def __init__(self, sender: FrameSender) -> None:
+        self._sender, self._number = sender, 0
+
+    def send(self, file: BenchFile, codes: CodeImage, lit_ns: int) -> None:
+        """Hand on codes (h, w) or (h, w, 3) that are lit since `lit_ns`, where somebody watches."""
+        if not self._sender.look():
+            return
+        height, width = codes.shape[:2]
+        channels = 3 if codes.ndim == 3 else 1
+        flat = codes.reshape(height * width, channels)
+        lit = np.flatnonzero(flat.any(axis=1))
+        self._number += 1
+        head = FrameHead(
+            frame=self._number,
+            lit_ns=lit_ns,
+            width=width,
+            height=height,
+            bits=file.config.monitor.bits,
+            channels=channels,
+            bench_sha256=file.sha256,
+        )
+        lit_codes = flat[lit] if channels == 3 else flat[lit, 0]
+        self._sender.put_frame(ShownFrame(head, lit.astype(np.uint32), lit_codes))
+
+
+# A pattern that stays is handed on again so often, for a watcher that came late.
+HANDED_ON_AGAIN_S = 0.5
+
+
 class PatternDisplay(Closing):
     """The window on the bench's display, opened with the first pattern. Free it with `close`, or
-    use it as a context.
+    use it as a context. `frames` hands the patterns to watchers.
     """
 
     def __init__(self) -> None:
+        self.frames: PatternFrames | None = None
         self._window: Window | None = None
         self._screen_px = (0, 0)
         self.force = False
@@ -301,11 +340,18 @@ class PatternDisplay(Closing):
         pause_s = 0.5 / file.config.monitor.refresh_hz if pattern.later else POLL_S
         shown = [_presenter(file, window, codes) for codes in pattern.frames]
         start_s, number = time.monotonic(), 0
+        handed_on_s = -math.inf
         window.keys.clear()  # keys pressed during the pattern before
         try:
             while time.monotonic() - start_s < SETTLE_S or not done():
-                shown[number % len(shown)][0].present()
+                place = number % len(shown)
+                shown[place][0].present()
                 window.swap()
+                now_s = time.monotonic()
+                is_due = bool(pattern.later) or now_s - handed_on_s > HANDED_ON_AGAIN_S
+                if self.frames is not None and is_due:
+                    self.frames.send(file, pattern.frames[place], time.monotonic_ns())
+                    handed_on_s = now_s
                 number += 1
                 window.look_at_events()
                 _go_on(window, bool({"q", "escape"} & set(window.keys)))
@@ -387,6 +433,11 @@ class _ShownHere(ImageSource):
     def gate(self, file: BenchFile) -> Timing | None:
         return None if self._shows else self._display.gate(file)
 
+    def hand_on(self, frames: PatternFrames) -> None:
+        if self._shows:
+            super().hand_on(frames)
+        self._display.frames = frames
+
     def unlit(self, stem: Path) -> Path | None:
         return self._dark
 
@@ -459,6 +510,70 @@ class GrabCommand(_ShownHere):
         else:
             _run(words, output, lambda done: self._display.show_until(file, pattern, done))
         return output
+
+
+class GrabCamera(_ShownHere):
+    """Images of a GenICam camera (see `server.genicam`), set as `[tracker.camera]` says.
+
+    Raises MachineError where Aravis or the camera is not there, InputError for features that it
+    does not take.
+    """
+
+    sets_exposure = True
+
+    def __init__(
+        self,
+        file: BenchFile,
+        name: str,
+        dark: Path | None = None,
+        diode: SerialDiode | None = None,
+    ) -> None:
+        super().__init__(dark, diode)
+        tracker = file.config.tracker
+        self.identity = f"grab: {PREFIX}{name}"
+        self._camera = GenicamCamera(name)
+        try:
+            about = self._camera.about
+            own_format = chosen_format(about["formats"], tracker.detector.bits)
+            form = tracker.camera.pixel_format or own_format
+            self._camera.set({"PixelFormat": form} | tracker.camera.settings())
+        except HilstarError:
+            self._camera.close()
+            raise
+        log.warning("the tracker's images are %s %s's, %s", about["vendor"], about["model"], form)
+
+    def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
+        """The camera's image of a pattern: a PNG of 16 bits. Raises NoImage."""
+        images: list[CodeImage] = []
+        begun = False
+
+        def done() -> bool:
+            # The exposure begins after the first call: by then the panel shows the pattern.
+            nonlocal begun
+            if not begun:
+                self._camera.begin(exposure_s)
+                begun = True
+            image = self._camera.image()
+            if image is not None:
+                images.append(image)
+            return bool(images)
+
+        try:
+            self._display.show_until(file, pattern, done)
+        except CameraError as error:
+            raise NoImage(str(error)) from error
+        image = images[0]
+        if not image.any():
+            log.warning("%s: every pixel is 0; look at the lens cap and the black level", stem.name)
+        path = stem.with_name(stem.name + ".png")
+        picture = png_of(image)
+        written(path, lambda output: output.write(picture))
+        return path
+
+    def close(self) -> None:
+        """Close the display and let the camera go."""
+        super().close()
+        self._camera.close()
 
 
 def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]], None]) -> None:

@@ -85,6 +85,34 @@ class TrackerOptics(Table, frozen=True):
         return self.temperature_k - self.reference_temperature_k
 
 
+class TrackerCamera(Table, frozen=True):
+    """How `--grab genicam:` sets the tracker's camera before it takes images. The exposure is the
+    session's own.
+    """
+
+    #: GenICam's name of grey or Bayer, such as `"Mono12"`. Default: the camera's format that holds
+    #: `[tracker.detector] bits`
+    pixel_format: str | None = None
+    gain: float | None = None  #: In the camera's own unit. Default: as the camera has it
+    #: `"software"`: each image is triggered. `"off"`: it is the first after its exposure is set.
+    trigger: Literal["off", "software"] = "off"
+    #: Other features by their GenICam names, such as `{ BlackLevel = 10.0 }`. Default: none
+    features: Annotated[
+        dict[str, bool | int | float | str], Meta(extra={"form": "{ NAME = VALUE, ... }"})
+    ] = msgspec.field(default_factory=dict)
+
+    def settings(self) -> dict[str, bool | int | float | str]:
+        """The features to set, by GenICam's names; the pixel format is not among them."""
+        features = dict(self.features)
+        if self.gain is not None:
+            features["Gain"] = self.gain
+        if self.trigger == "software":
+            features["TriggerSelector"] = "FrameStart"
+            features["TriggerSource"] = "Software"
+            features["TriggerMode"] = "On"
+        return features
+
+
 class Tracker(Table, frozen=True):
     """The star tracker under test."""
 
@@ -131,6 +159,7 @@ class Tracker(Table, frozen=True):
     tolerance_mag: Positive = 0.02  #: Flux error that a star may then have, for `effort = "auto"`.
     tolerance_px: Positive = 0.02  #: Centroid error that it may have, in tracker pixels.
     optics: TrackerOptics = msgspec.field(default_factory=TrackerOptics)
+    camera: TrackerCamera = msgspec.field(default_factory=TrackerCamera)
     detector: DetectorSettings = msgspec.field(default_factory=DetectorSettings)
 
     @property

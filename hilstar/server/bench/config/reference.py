@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
-from msgspec import NODEFAULT, Meta
+from msgspec import Meta
 from msgspec.structs import FieldInfo
 
 from hilstar.basics.toml_tables import plain
@@ -140,7 +140,7 @@ def row(field: FieldInfo, hint: Any, told: str) -> str:
     comment (see `meanings_of`).
     """
     meaning, _, default = told.partition(" Default: ")
-    if field.default is NODEFAULT:
+    if field.required:
         default = "**required**"
     return (
         f"| `{field.name}` | {value_text(field.name, hint)} |"

@@ -184,7 +184,7 @@ def test_the_live_tracker_before_a_coloured_display_finds_its_attitude_in_superp
                 ShownFrame(FrameHead(number, lit_ns, 640, 480, 10, tuple(q), 3), lit, codes[lit])
             )
         exposed = tracker.frames.exposed(0, round(EXPOSURE_S * 1e9))
-        solved = tracker.solve(exposed)
+        solved = tracker.solve(exposed, tracker.expose(exposed))
     assert solved.mode == TRACKING and len(solved.identified.star) >= 8
     off = to_rotation_vector(multiply(solved.identified.q_icrs_to_cam, conjugate(q)))
     assert np.linalg.norm(off[:2]) < 0.1 * 13e-3 / 25  # a tenth of a pixel

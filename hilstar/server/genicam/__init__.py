@@ -1,0 +1,3 @@
+"""Cameras by GenICam (GigE Vision, USB3 Vision) through Aravis: listed, set, and their images
+taken.
+"""

@@ -1,0 +1,3 @@
+"""A GigE Vision camera: its registers and description, its two protocols without I/O, and its
+sockets.
+"""

@@ -1,0 +1,175 @@
+"""`hilstar tracker --camera` before a running display: its exposures in an outside client, and in
+one of plain sockets.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_radec_roll_deg
+from tests.support.benches import ROOT, TWIN, bench_text
+from tests.support.commands import HILSTAR
+from tests.support.forks import Started
+from tests.support.gige_client import GigEClient, own_address
+from tests.support.senders import free_port
+from tests.support.waiting import PATIENCE_S, wait_for
+
+pytestmark = pytest.mark.e2e
+
+SIDE_PX = TWIN["tracker"]["resolution_px"][0]
+SYSTEM_PYTHON = Path("/usr/bin/python3")
+ARAVIS = """
+import gi, json, sys
+gi.require_version("Aravis", "0.8")
+from gi.repository import Aravis
+camera = Aravis.Camera.new(sys.argv[1])
+camera.set_exposure_time(60000.0)
+stream = camera.create_stream(None, None)
+for _ in range(8):
+    stream.push_buffer(Aravis.Buffer.new_allocate(camera.get_payload()))
+camera.start_acquisition()
+numbers, brightest = [], 0
+for _ in range(int(sys.argv[2])):
+    buffer = stream.timeout_pop_buffer(60_000_000)
+    if buffer is not None and buffer.get_status() == Aravis.BufferStatus.SUCCESS:
+        numbers.append(buffer.get_frame_id())
+        brightest = max(brightest, *memoryview(buffer.get_data()).cast("H"))
+        stream.push_buffer(buffer)
+camera.stop_acquisition()
+print(json.dumps({
+    "vendor": camera.get_vendor_name(), "numbers": numbers, "brightest": brightest,
+    "format": camera.get_pixel_format_as_string(), "exposure_us": camera.get_exposure_time(),
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def display(tmp_path_factory):
+    """A replay of one attitude that sends its frames: the bench file, and the endpoint."""
+    folder, endpoint = tmp_path_factory.mktemp("display"), f"tcp://127.0.0.1:{free_port()}"
+    (folder / "bench.toml").write_text(bench_text(TWIN, {"render": {"quantisation": "round"}}))
+    q = ",".join(repr(float(part)) for part in from_radec_roll_deg(84.057, -1.2, 0.0))
+    (folder / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{q}\n600,{q}\n")
+    command = [*HILSTAR, "replay", folder / "bench.toml", folder / "log.csv", "--headless"]
+    with Started(
+        [*map(str, command), "--frames", endpoint],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        yield folder / "bench.toml", endpoint
+        process.terminate()
+        process.wait(PATIENCE_S)
+
+
+def tracker(display, *options):
+    bench, endpoint = display
+    command = [*HILSTAR, "tracker", bench, "--watch", endpoint, *options, "--json"]
+    return Started(
+        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def ended(process):
+    process.terminate()
+    out, err = process.communicate(timeout=PATIENCE_S)
+    return json.loads(out), err
+
+
+def opened(client: GigEClient) -> GigEClient:
+    """The client once the camera answers."""
+
+    def answers() -> bool:
+        client.socket.settimeout(0.5)
+        try:
+            client.describe()
+        except OSError:
+            return False
+        return True
+
+    wait_for(answers, "the camera answers")
+    client.socket.settimeout(PATIENCE_S)
+    return client
+
+
+def test_a_triggered_exposure_is_one_image_of_the_stars_that_are_lit(display):
+    address = own_address()
+    with tracker(display, "--camera", address) as process, GigEClient(address) as client:
+        opened(client)
+        assert client.control() == 0
+        client.set("TriggerMode", 1)
+        client.set("AcquisitionStart", 1)
+        stamps = []
+        for k in range(3):
+            client.set("TriggerSoftware", 1)
+            number, stamp_ns, image = client.image(SIDE_PX, SIDE_PX)
+            assert number == k + 1
+            stamps.append(stamp_ns)
+            # Stars of Orion's belt over a background of noise.
+            assert image.max() > np.median(image) + 20 * image.std() / 10
+            assert np.count_nonzero(image > np.median(image) + 8 * _noise(image)) > 10
+        assert stamps == sorted(stamps)
+        told, _ = ended(process)
+    assert told["camera"]["triggers"] == told["camera"]["images"] == 3
+    assert told["answers"] == 0
+
+
+def _noise(image: np.ndarray) -> float:
+    return float(1.4826 * np.median(np.abs(image - np.median(image)))) + 1e-9
+
+
+def test_it_answers_while_its_images_are_taken(display):
+    address, port = own_address(), free_port()
+    answering = ("--answer", f"udp://127.0.0.1:{port}", "--solver", "truth")
+    with (
+        tracker(display, "--camera", address, *answering) as process,
+        GigEClient(address) as client,
+    ):
+        opened(client)
+        client.control()
+        client.set("AcquisitionStart", 1)
+        numbers = [client.image(SIDE_PX, SIDE_PX)[0] for _ in range(5)]
+        told, _ = ended(process)
+    assert numbers == [1, 2, 3, 4, 5]
+    assert told["answers"] >= 5
+
+
+def test_aravis_finds_it_sets_it_and_loses_no_image(display):
+    """Aravis (Debian: gir1.2-aravis-0.8) is a client by others, of the whole standard."""
+    probe = [SYSTEM_PYTHON, "-c", "import gi; gi.require_version('Aravis', '0.8')"]
+    if (
+        not SYSTEM_PYTHON.exists()
+        or subprocess.run(probe, capture_output=True, check=False).returncode
+    ):
+        pytest.skip("Aravis is not installed (gir1.2-aravis-0.8, python3-gi)")
+    address, count = own_address(), 20
+    with tracker(display, "--camera", address) as process:
+        with GigEClient(address) as client:
+            opened(client)
+        grabbed = subprocess.run(
+            [SYSTEM_PYTHON, "-c", ARAVIS, address, str(count)],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=4 * PATIENCE_S,
+        )
+        assert grabbed.returncode == 0, grabbed.stderr
+        told, err = ended(process)
+    seen = json.loads(grabbed.stdout.splitlines()[-1])
+    assert seen["vendor"] == "hilstar" and seen["exposure_us"] == 60000.0
+    assert seen["numbers"] == list(range(1, count + 1)), (told, err)
+    assert seen["brightest"] > 100
+    assert told["camera"]["dropped"] == 0
+
+
+def test_without_answers_or_a_camera_it_says_what_to_write(display):
+    bench, endpoint = display
+    command = [sys.executable, "-m", "hilstar", "tracker", str(bench), "--watch", endpoint]
+    refused = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert refused.returncode == 2
+    assert "write --answer TARGET, --camera, or both" in refused.stderr

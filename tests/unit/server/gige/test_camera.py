@@ -1,0 +1,161 @@
+"""The camera over real sockets on loopback: images as they were given, and hostile clients."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.endpoint import AllowedSenders
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.server.gige.camera import GigECamera, camera_address
+from hilstar.server.gige.registers import CameraIdentity, CameraSettings
+from tests.support.gige_client import (
+    DISCOVER,
+    RESEND,
+    STREAM_ADDRESS,
+    GigEClient,
+    command,
+    own_address,
+)
+from tests.support.waiting import wait_for
+
+SIDE_PX = 256
+
+
+@contextlib.contextmanager
+def camera(allow: tuple[str, ...] = (), rate_hz: float = 50.0) -> Iterator[GigECamera]:
+    address = own_address()
+    identity = CameraIdentity(ipaddress.IPv4Address(address), "virtual tracker", "1", "abc")
+    settings = CameraSettings(SIDE_PX, SIDE_PX, 12, 0.01, rate_hz)
+    with GigECamera(identity, settings, AllowedSenders(allow), Notices()) as made:
+        made.address = address  # type: ignore[attr-defined]
+        yield made
+
+
+@contextlib.contextmanager
+def streaming(made: GigECamera) -> Iterator[GigEClient]:
+    with GigEClient(made.address) as client:  # type: ignore[attr-defined]
+        client.describe()
+        assert client.control() == 0
+        assert client.set("AcquisitionStart", 1) == 0
+        wait_for(lambda: made.wanted, "the camera streams")
+        yield client
+
+
+def test_images_arrive_bit_for_bit_with_their_times():
+    rng = np.random.default_rng(3)
+    with camera() as made, streaming(made) as client:
+        for k in range(5):
+            dn = rng.integers(0, 4096, (SIDE_PX, SIDE_PX), dtype=np.uint16)
+            begin_ns = time.monotonic_ns()
+            made.take(dn, begin_ns)
+            number, stamp_ns, image = client.image(SIDE_PX, SIDE_PX)
+            assert (number, stamp_ns) == (k + 1, begin_ns)
+            np.testing.assert_array_equal(image, dn)
+        wait_for(lambda: made.counts.images == 5, "the last image is counted")
+        assert made.counts.dropped == 0
+
+
+def test_a_lost_packet_is_sent_again():
+    dn = np.arange(SIDE_PX * SIDE_PX, dtype=np.uint16).reshape(SIDE_PX, SIDE_PX) % 4096
+    with camera() as made, streaming(made) as client:
+        made.take(dn, time.monotonic_ns())
+        number, _, packets = client.block()
+        body = struct.pack(">HHII", 0, number, 3, 4)
+        client.socket.sendto(command(RESEND, body, 999, flags=0), (client.address, 3956))
+        again = [client.stream.recv(65536)[8:] for _ in range(2)]
+        assert again == [packets[3], packets[4]]
+        body = struct.pack(">HHII", 0, number + 9, 3, 4)
+        client.socket.sendto(command(RESEND, body, 1000, flags=0), (client.address, 3956))
+        assert struct.unpack(">H", client.stream.recv(100)[:2])[0] == 0x800C
+
+
+def test_a_single_frame_is_one_and_an_exposure_begun_before_the_start_is_none():
+    dn = np.zeros((SIDE_PX, SIDE_PX), np.uint16)
+    with camera() as made, GigEClient(made.address) as client:  # type: ignore[attr-defined]
+        client.describe()
+        client.control()
+        client.set("AcquisitionMode", 1)
+        before_ns = time.monotonic_ns()
+        client.set("AcquisitionStart", 1)
+        wait_for(lambda: made.wanted, "the camera streams")
+        made.take(dn, before_ns)
+        made.take(dn + 7, time.monotonic_ns())
+        made.take(dn + 8, time.monotonic_ns())
+        number, _, image = client.image(SIDE_PX, SIDE_PX)
+        assert number == 1 and (image == 7).all()
+        assert not made.wanted
+
+
+def test_another_clients_address_is_refused_over_the_wire():
+    with camera() as made, streaming(made) as client:
+        elsewhere = int(ipaddress.IPv4Address("127.0.0.9"))
+        assert client.write(STREAM_ADDRESS, elsewhere) == 0x8006
+
+
+def test_a_client_that_is_not_allowed_is_never_answered():
+    with (
+        camera(allow=("127.0.9.9",)) as made,
+        GigEClient(made.address, own="127.0.9.9") as friend,  # type: ignore[attr-defined]
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+    ):
+        for number in range(1, 50):
+            stranger.sendto(command(DISCOVER, number=number), (friend.address, 3956))
+        # Answers come in order: had the stranger been answered, it was before this.
+        assert friend.ask(DISCOVER)[0] == 0
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.recv(2048)
+
+
+def test_hostile_clients_leave_the_controller_its_images():
+    """24 of them at 100 datagrams a second each; what they cost is counted, not timed."""
+    stop = threading.Event()
+    rng = np.random.default_rng(1)
+
+    def attack(address: str, seed: int) -> None:
+        mine = np.random.default_rng(seed)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
+            while not stop.wait(0.01):
+                kind = int(mine.choice([DISCOVER, 0x80, 0x82, 0x84, 0x86, 0x40, 7]))
+                body = mine.bytes(int(mine.integers(0, 64)))
+                sending.sendto(command(kind, body, int(mine.integers(1, 65536))), (address, 3956))
+
+    with camera() as made, streaming(made) as client:
+        crowd = [threading.Thread(target=attack, args=(client.address, seed)) for seed in range(24)]
+        for thread in crowd:
+            thread.start()
+        try:
+            for _ in range(20):
+                dn = rng.integers(0, 4096, (SIDE_PX, SIDE_PX), dtype=np.uint16)
+                made.take(dn, time.monotonic_ns())
+                np.testing.assert_array_equal(client.image(SIDE_PX, SIDE_PX)[2], dn)
+                assert client.read(0x0A00) == 2
+        finally:
+            stop.set()
+            for thread in crowd:
+                thread.join()
+        assert made.settings.streaming
+
+
+@pytest.mark.parametrize("text", ["0.0.0.0", "224.0.0.1", "camera", "::1", "127.0.0.2:3956", ""])
+def test_an_address_that_is_none_is_refused_in_one_line(text):
+    with pytest.raises(InputError, match="--camera"):
+        camera_address(text)
+
+
+def test_a_second_camera_at_one_address_says_what_to_do():
+    with camera() as made:
+        identity = CameraIdentity(ipaddress.IPv4Address(made.address), "m", "1", "s")  # type: ignore[attr-defined]
+        settings = CameraSettings(8, 8, 12, 0.01, 10.0)
+        with pytest.raises(InputError, match="in use; stop the camera"):
+            GigECamera(identity, settings, AllowedSenders(()), Notices())

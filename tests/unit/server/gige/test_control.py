@@ -1,0 +1,260 @@
+"""The control channel of the camera: who may do what, and that nothing else happens."""
+
+from __future__ import annotations
+
+import ipaddress
+import struct
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilstar.basics.units import NS_PER_MS
+from hilstar.server.gige.control import ControlChannel, FeatureCommand, Released, Resend
+from hilstar.server.gige.description import describe
+from hilstar.server.gige.registers import (
+    ADDRESSES,
+    DESCRIPTION_AT,
+    FEATURES,
+    PIXEL_FORMATS,
+    CameraIdentity,
+    CameraSettings,
+    GvcpStatus,
+    Registers,
+)
+from tests.support.gige_client import (
+    CONTROL,
+    DISCOVER,
+    PACKET_BYTES,
+    PRIVILEGE,
+    READ,
+    READ_MEMORY,
+    RESEND,
+    STREAM_ADDRESS,
+    STREAM_PORT,
+    WRITE,
+    command,
+    write_of,
+)
+
+CLIENT, OTHER = ("127.0.0.1", 40_000), ("127.0.0.1", 40_001)
+HERE = int(ipaddress.IPv4Address("127.0.0.1"))
+ELSEWHERE = int(ipaddress.IPv4Address("192.168.7.7"))
+IDENTITY = CameraIdentity(ipaddress.IPv4Address("127.0.0.2"), "virtual tracker", "1", "abc")
+
+
+def channel(bits: int = 12) -> ControlChannel:
+    camera = CameraSettings(64, 48, bits, exposure_s=0.05, rate_hz=10.0)
+    return ControlChannel(Registers(IDENTITY, camera, describe(IDENTITY.model, camera)))
+
+
+class Asker:
+    """Sends commands to a channel, each with a number of its own."""
+
+    def __init__(self, to: ControlChannel, peer: tuple[str, int] = CLIENT) -> None:
+        self.to, self.peer, self.number = to, peer, 0
+        self.now_ns = 0
+
+    def ask(self, kind: int, body: bytes = b"") -> tuple[int, bytes]:
+        self.number += 1
+        answer = self.to.receive(command(kind, body, self.number), self.peer, self.now_ns)
+        assert answer is not None
+        status, answered, size, number = struct.unpack(">HHHH", answer[:8])
+        assert (answered, size, number) == (kind + 1, len(answer) - 8, self.number)
+        return status, answer[8:]
+
+    def write(self, address: int, value: int) -> int:
+        return self.ask(WRITE, write_of(address, value))[0]
+
+    def read(self, address: int) -> int:
+        status, body = self.ask(READ, struct.pack(">I", address))
+        assert status == GvcpStatus.SUCCESS
+        return int.from_bytes(body, "big")
+
+
+def test_a_discovery_gives_the_first_registers_with_the_cameras_name_and_address():
+    status, body = Asker(channel()).ask(DISCOVER)
+    assert status == 0 and len(body) == 0xF8
+    assert body[0x48:0x50] == b"hilstar\0" and body[0x68:0x78] == b"virtual tracker\0"
+    assert body[0x24:0x28] == ipaddress.IPv4Address("127.0.0.2").packed
+
+
+def test_a_peer_without_the_privilege_reads_and_writes_nothing():
+    camera = channel()
+    asker = Asker(camera)
+    assert asker.read(ADDRESSES["Width"]) == 64
+    assert asker.write(ADDRESSES["TriggerMode"], 1) == GvcpStatus.ACCESS_DENIED
+    assert asker.write(STREAM_PORT, 5000) == GvcpStatus.ACCESS_DENIED
+    assert camera.destination is None and not camera.registers.settings.triggered
+
+
+def test_one_peer_controls_at_a_time_until_it_gives_back_or_falls_silent():
+    camera = channel()
+    first, second = Asker(camera), Asker(camera, OTHER)
+    assert first.write(PRIVILEGE, CONTROL) == 0
+    assert second.write(PRIVILEGE, CONTROL) == GvcpStatus.ACCESS_DENIED
+    assert first.write(PRIVILEGE, 0) == 0
+    assert camera.take_events() == [Released(silent=False)]
+    assert second.write(PRIVILEGE, CONTROL) == 0
+    second.now_ns = 2900 * NS_PER_MS
+    assert second.read(PRIVILEGE) == CONTROL
+    first.now_ns = 5800 * NS_PER_MS
+    assert first.write(PRIVILEGE, CONTROL) == GvcpStatus.ACCESS_DENIED
+    first.now_ns = 6000 * NS_PER_MS
+    assert first.write(PRIVILEGE, CONTROL) == 0
+    assert camera.take_events() == [Released(silent=True)]
+
+
+def test_images_go_to_the_controllers_own_address_alone():
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    assert client.write(STREAM_ADDRESS, ELSEWHERE) == GvcpStatus.ACCESS_DENIED
+    memory = struct.pack(">II", STREAM_ADDRESS, ELSEWHERE)
+    assert client.ask(0x0086, memory)[0] == GvcpStatus.ACCESS_DENIED
+    across = struct.pack(">I", STREAM_ADDRESS - 4) + struct.pack(">II", 0, ELSEWHERE)
+    assert client.ask(0x0086, across)[0] != 0
+    assert client.write(STREAM_ADDRESS, HERE) == 0
+    assert camera.destination is None  # no port yet
+    client.write(STREAM_PORT, 5123)
+    assert camera.destination == ("127.0.0.1", 5123)
+
+
+def test_a_trigger_whose_answer_was_lost_begins_one_exposure():
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    again = command(WRITE, write_of(ADDRESSES["TriggerSoftware"], 1), number=77)
+    answers = [camera.receive(again, CLIENT, 0) for _ in range(3)]
+    assert answers[0] is not None and answers == answers[:1] * 3
+    assert camera.take_events() == [FeatureCommand("TriggerSoftware")]
+
+
+def test_packets_are_sent_again_for_the_controller_alone():
+    camera = channel()
+    Asker(camera).write(PRIVILEGE, CONTROL)
+    body = struct.pack(">HHII", 0, 5, 3, 9)
+    assert camera.receive(command(RESEND, body, 9, flags=0), OTHER, 0) is None
+    assert camera.take_events() == []
+    assert camera.receive(command(RESEND, body, 9, flags=0), CLIENT, 0) is None
+    assert camera.take_events() == [Resend(5, 3, 9)]
+
+
+@pytest.mark.parametrize(
+    ("feature", "value", "status"),
+    [
+        ("Width", 32, GvcpStatus.WRITE_PROTECT),
+        ("PixelFormat", 0x0110_0003, GvcpStatus.INVALID_PARAMETER),  # Mono10 of a 12 bit detector
+        ("PixelFormat", PIXEL_FORMATS["Mono12Packed"].number, GvcpStatus.SUCCESS),
+        ("TriggerMode", 2, GvcpStatus.INVALID_PARAMETER),
+        ("AcquisitionFrameCount", 0, GvcpStatus.INVALID_PARAMETER),
+        ("TriggerSoftware", 0, GvcpStatus.INVALID_PARAMETER),
+    ],
+)
+def test_a_value_that_the_camera_would_not_keep_is_refused(feature, value, status):
+    client = Asker(channel())
+    client.write(PRIVILEGE, CONTROL)
+    assert client.write(ADDRESSES[feature], value) == status
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0, 61e6])
+def test_an_exposure_that_no_camera_makes_is_refused(value):
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    (word,) = struct.unpack(">I", struct.pack(">f", value))
+    assert client.write(ADDRESSES["ExposureTime"], word) == GvcpStatus.INVALID_PARAMETER
+    assert camera.registers.settings.exposure_s == 0.05
+
+
+def test_a_longer_exposure_lowers_the_rate_and_a_rate_beyond_it_is_refused():
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    assert client.write(ADDRESSES["ExposureTime"], _word(500_000.0)) == 0
+    assert camera.registers.settings.rate_hz == pytest.approx(2.0)
+    assert client.write(ADDRESSES["AcquisitionFrameRate"], _word(3.0)) != 0
+    assert client.write(ADDRESSES["AcquisitionFrameRate"], _word(1.5)) == 0
+
+
+def test_the_pixel_format_holds_while_images_flow():
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    camera.registers.settings.streaming = True
+    number = PIXEL_FORMATS["Mono8"].number
+    assert client.write(ADDRESSES["PixelFormat"], number) == GvcpStatus.ACCESS_DENIED
+
+
+def test_every_feature_of_the_description_is_a_register_that_can_be_read():
+    client = Asker(channel())
+    root = ElementTree.fromstring(_description(client))
+    space = "{http://www.genicam.org/GenApi/Version_1_1}"
+    names = {node.get("Name") for node in root}
+    for node in root.iter(f"{space}pFeature"):
+        assert node.text in names
+    for node in root.iter(f"{space}pValue"):
+        assert node.text in names
+    for node in root.iter(f"{space}Address"):
+        client.read(int(node.text or "", 16))
+    assert {feature.name for feature in FEATURES} <= names
+
+
+def _description(client: Asker) -> str:
+    size = int(
+        client.ask(READ_MEMORY, struct.pack(">IHH", 0x200, 0, 512))[1][4:]
+        .split(b";")[2]
+        .split(b"\0")[0],
+        16,
+    )
+    parts = []
+    for at in range(0, size, 512):
+        count = -(-min(512, size - at) // 4) * 4
+        status, body = client.ask(READ_MEMORY, struct.pack(">IHH", DESCRIPTION_AT + at, 0, count))
+        assert status == 0
+        parts.append(body[4:])
+    return b"".join(parts)[:size].decode()
+
+
+def _word(value: float) -> int:
+    return int.from_bytes(struct.pack(">f", value), "big")
+
+
+KINDS = st.sampled_from([DISCOVER, READ, WRITE, READ_MEMORY, RESEND, 0x0086, 0x0004, 0x00C0])
+ADDRESS = st.sampled_from(
+    [PRIVILEGE, STREAM_PORT, PACKET_BYTES, STREAM_ADDRESS, 0x938, 0x944, *ADDRESSES.values()]
+) | st.integers(0, 2**32 - 1)
+WORDS = st.lists(ADDRESS | st.integers(0, 2**32 - 1), max_size=6)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(
+        st.one_of(
+            st.binary(max_size=80),
+            st.builds(
+                lambda kind, words, number, tail: command(
+                    kind, struct.pack(f">{len(words)}I", *words) + tail, number
+                ),
+                KINDS,
+                WORDS,
+                st.integers(0, 65535),
+                st.binary(max_size=3),
+            ),
+        ),
+        max_size=12,
+    ),
+    st.lists(st.sampled_from([CLIENT, OTHER, ("192.168.7.7", 9)]), min_size=12, max_size=12),
+)
+def test_whatever_comes_nothing_is_raised_and_images_go_to_the_controller_alone(datagrams, peers):
+    camera = channel()
+    for datagram, peer in zip(datagrams, peers, strict=False):
+        answer = camera.receive(datagram, peer, 0)
+        assert answer is None or len(answer) <= 8 + 540
+        if camera.destination is not None:
+            assert camera.controller is not None
+            assert camera.destination[0] == camera.controller[0]
+        settings_now = camera.registers.settings
+        assert 0 < settings_now.exposure_s <= 60 and 0 <= settings_now.gain_db <= 24
+        assert settings_now.rate_hz * settings_now.exposure_s <= 1 + 1e-5

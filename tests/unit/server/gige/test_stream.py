@@ -1,0 +1,71 @@
+"""The stream of the camera: every DN arrives as it is, in each pixel format."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from hilstar.server.gige.registers import PIXEL_FORMATS, CameraSettings
+from hilstar.server.gige.stream import LAST_BLOCK, image_block, next_block, packed
+
+RNG = np.random.default_rng(5)
+
+
+def unpacked_threes(data: bytes, bits: int, count: int) -> np.ndarray:
+    """Pixels of GigE Vision's packed formats, from the standard's figure, one by one."""
+    low = bits - 8
+    values = []
+    for first, middle, second in struct.iter_unpack("BBB", data):
+        values += [first << low | middle & 0xF, second << low | middle >> 4]
+    return np.array(values[:count], np.uint16)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_every_format_of_a_detector_gives_its_dn_back(bits):
+    dn = RNG.integers(0, 2**bits, (6, 10), dtype=np.uint16)
+    camera = CameraSettings(10, 6, bits, 0.1, 1.0)
+    for name in camera.pixel_formats():
+        camera.pixel_format = name
+        data = packed(dn, bits, name)
+        assert len(data) == camera.payload_bytes
+        form = PIXEL_FORMATS[name]
+        if form.stored_bits == 16:
+            values = np.frombuffer(data, "<u2")
+        elif form.stored_bits == 8:
+            values = np.frombuffer(data, np.uint8)
+        else:
+            values = unpacked_threes(data, form.bits, dn.size)
+        expected = dn >> max(bits - form.bits, 0)
+        np.testing.assert_array_equal(values.reshape(dn.shape), expected)
+
+
+def test_an_odd_number_of_packed_pixels_takes_whole_bytes():
+    dn = RNG.integers(0, 4096, (3, 5), dtype=np.uint16)
+    camera = CameraSettings(5, 3, 12, 0.1, 1.0, pixel_format="Mono12Packed")
+    data = packed(dn, 12, "Mono12Packed")
+    assert len(data) == camera.payload_bytes == 24
+    np.testing.assert_array_equal(unpacked_threes(data, 12, 15), dn.ravel())
+
+
+@pytest.mark.parametrize("packet_bytes", [576, 1500, 9000])
+def test_a_block_has_leader_data_and_trailer_numbered_from_0(packet_bytes):
+    dn = RNG.integers(0, 4096, (48, 64), dtype=np.uint16)
+    camera = CameraSettings(64, 48, 12, 0.1, 1.0)
+    block = image_block(7, dn, 0x1_2345_6789_ABCD, camera, packet_bytes)
+    packets = [b"".join(packet) for packet in block.packets()]
+    assert all(len(packet) <= packet_bytes - 28 for packet in packets)
+    heads = [struct.unpack(">HHI", packet[:8]) for packet in packets]
+    assert [head[2] & 0xFF_FFFF for head in heads] == list(range(len(packets)))
+    assert [head[2] >> 24 for head in heads] == [1, *[3] * (len(packets) - 2), 2]
+    assert {head[:2] for head in heads} == {(0, 7)}
+    _, kind, stamp, form, width, height = struct.unpack(">HHQIII", packets[0][8:32])
+    assert (kind, stamp, width, height) == (1, 0x1_2345_6789_ABCD, 64, 48)
+    assert form == 0x0110_0005
+    data = b"".join(packet[8:] for packet in packets[1:-1])
+    np.testing.assert_array_equal(np.frombuffer(data, "<u2").reshape(48, 64), dn)
+
+
+def test_blocks_are_numbered_from_1_again_after_the_last():
+    assert next_block(0) == 1 and next_block(LAST_BLOCK) == 1

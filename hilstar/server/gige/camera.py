@@ -232,7 +232,7 @@ class GigECamera(Closing):
             if not self._allowed.admits(peer[0]):
                 strangers += 1
                 host = peer[0]
-            elif peer == self.channel.controller or self._others.take():
+            elif self.channel.is_client(peer) or self._others.take():
                 self._answer(data, peer)
         if strangers:
             self._refuse(strangers, host, directed=listening is self._control_socket)

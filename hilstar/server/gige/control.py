@@ -134,6 +134,12 @@ class ControlChannel:
         """Of the stream, with its headers."""
         return self.registers.word(STREAM_PACKET_BYTES) & PACKET_SIZE_MASK
 
+    def is_client(self, peer: Peer) -> bool:
+        """Whether a peer is the controller, or where its images go: clients ask for lost packets
+        from there (Aravis does).
+        """
+        return peer in {self.controller, self.destination}
+
     def tick(self, now_ns: int) -> None:
         """Let a controller go that has been silent for too long."""
         heartbeat_ns = self.registers.word(HEARTBEAT_MS) * NS_PER_MS
@@ -251,7 +257,7 @@ class ControlChannel:
 
     def _resend(self, body: bytes, peer: Peer) -> None:
         """A request for packets; it has no answer but these."""
-        if peer != self.controller or len(body) != RESEND.size:
+        if not self.is_client(peer) or len(body) != RESEND.size:
             return
         _, block, first, last = RESEND.unpack(body)
         first, last = first & 0xFF_FFFF, last & 0xFF_FFFF

@@ -141,6 +141,18 @@ def test_packets_are_sent_again_for_the_controller_alone():
     assert camera.take_events() == [Resend(5, 3, 9)]
 
 
+def test_packets_are_sent_again_to_the_socket_that_takes_the_images():
+    """Aravis asks from it, and not from the one that controls."""
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    client.write(STREAM_PORT, OTHER[1])
+    body = struct.pack(">HHII", 0, 5, 3, 9)
+    assert camera.receive(command(RESEND, body, 9, flags=0), OTHER, 0) is None
+    assert camera.take_events() == [Resend(5, 3, 9)]
+    assert Asker(camera, OTHER).write(ADDRESSES["TriggerMode"], 1) == GvcpStatus.ACCESS_DENIED
+
+
 @pytest.mark.parametrize(
     ("feature", "value", "status"),
     [

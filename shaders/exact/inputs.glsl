@@ -45,7 +45,6 @@ uniform sampler2D gain;
 #endif
 
 uniform int count;
-uniform int alone;     // of primaries, stars whose pixels no other star lights, the first in their order: there are no sums of them
 uniform int footprint;  // pixels in all
 uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in footprints.py
 uniform int fewest;

@@ -28,16 +28,17 @@ for codes in ("round", "dither", "exact", "temporal", "auto"):
 print(json.dumps(found))
 """
 WITH_COMPUTE = {
-    "round": "compute shaders",
+    "round": "CPU",
     "dither": "points",
-    "exact": "compute shaders",
-    "temporal": "compute shaders",
+    "exact": "CPU, then compute shaders",
+    "temporal": "CPU, then compute shaders",
 }
-WITHOUT = {"round": "points", "dither": "points", "exact": "NumPy", "temporal": "NumPy"}
+WITHOUT = {"round": "CPU", "dither": "points", "exact": "NumPy", "temporal": "NumPy"}
 
 
 def at_version(version: str, command: list[str], folder) -> str:
     environment = os.environ | {"MESA_GL_VERSION_OVERRIDE": version}
+    environment.pop("HILSTAR_DRAW", None)
     ran = subprocess.run(
         command,
         capture_output=True,

@@ -8,7 +8,7 @@
 #define BITS uvec4
 #endif
 
-layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as in light.comp
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as SPRITE_DTYPE, and each plane's light
 // A footprint's pixels by distance, for each phase: in a block where there is room, as the light of levels in floor.glsl.
 #ifdef ORDER_ROWS
 layout(std140, binding = 1) uniform Order { uvec4 order_rows[ORDER_ROWS]; };

@@ -30,8 +30,8 @@ PIXEL_LIMIT = 2 * 4.4e-7
 BLEND_LIMIT = 1e-6
 
 
-# A linear image beside codes is rasterised; alone, it is added up in the process's memory where
-# this GL can (host_image.py).
+# A linear image beside codes is rasterised; alone, it is drawn on the CPU where that draws stars
+# (cpu_stars.py).
 BOTH_WAYS = pytest.mark.parametrize("bits", [8, None], ids=["beside codes", "alone"])
 
 

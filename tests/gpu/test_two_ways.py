@@ -161,18 +161,17 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
     assert_same("round", *both_ways(target, frames, monkeypatch))
 
 
+@pytest.mark.parametrize("smaller", [False, True], ids=["whole", "smaller sprites"])
 @pytest.mark.parametrize("sigma_px", [(0.4, 0.4), USUAL, (1.2, 0.8)])
-def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, rng):
+def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, smaller, rng):
     """`temporal` chooses among all near pixels, some of which lie a little beyond its reach:
     they are erased too.
     """
     frames = [stars(600, sigma_px, rng) for _ in range(12)]
     side = GaussianPsf(sigma_px).footprint_px
-    for codes, sprites in zip(
-        drawn(Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal"), frames),
-        frames,
-        strict=True,
-    ):
+    sides = (SpriteSide(3e38, 2 + side % 2),) if smaller else ()
+    target = Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal", sides=sides)
+    for codes, sprites in zip(drawn(target, frames), frames, strict=True):
         under = np.zeros(SIZE[::-1], dtype=bool)
         for x, y in sprites.data["pixel"] - (side - 1) // 2:
             under[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] = True

@@ -211,8 +211,8 @@ class CpuStars:
             around = 2 * (away_px + np.float32(0.5)).astype(np.intp) + 1
         else:
             around = 2 * away_px.astype(np.intp) + 2
-        sides: IntArray = np.clip(around, self._least_side_px, self._units.side_px)
-        return sides
+        sides: IntArray = np.minimum(around, self._units.side_px)
+        return np.maximum(sides, self._least_side_px)
 
     def _reach_px(self, sprites: FrameLight) -> Float32Array:
         """The half axes (2, n) of the ellipses that sprites light."""
@@ -231,9 +231,9 @@ class CpuStars:
 
     def _add(self, squares: Squares, rates: list[Float32Array], reach_px: Float32Array) -> None:
         """Add the light of the stars of squares, which reaches so far, to their pixels' sums."""
-        dark = self._beyond_reach(squares, reach_px)
+        is_lit = self._within_reach(squares, reach_px)
         if squares.on_image is not None:
-            dark |= ~squares.on_image
+            is_lit &= squares.on_image
         flat, place = self._sums.reshape(-1), squares.place.ravel()
         for plane, rate in enumerate(rates):
             fraction_px = squares.fraction_px
@@ -244,14 +244,14 @@ class CpuStars:
             )
             most = self._units.most_e_per_s[plane] / self.unit_e_per_s[plane]
             np.minimum(units, np.float32(most), out=units)
+            units *= is_lit
             units += np.float32(0.5)
             added = units.astype(flat.dtype)
-            added[dark] = 0
             where = place if self._count == 1 else place * self._count + plane
             np.add.at(flat, where, added.ravel())
 
-    def _beyond_reach(self, squares: Squares, reach_px: Float32Array) -> BoolArray:
-        """Which pixels (side, side, n) of squares lie beyond their stars' ellipses, as in
+    def _within_reach(self, squares: Squares, reach_px: Float32Array) -> BoolArray:
+        """Which pixels (side, side, n) of squares lie within their stars' ellipses, as in
         splat.frag.
         """
         away = squares.offset_px[:, None]
@@ -261,7 +261,13 @@ class CpuStars:
         up /= np.maximum(reach_px[1], np.float32(LEAST_PX))
         wide = reach_px[0] * np.sqrt(np.maximum(1 - up * up, np.float32(0))) + margin_x
         wide[away_y > reach_px[1] + margin_y] = -1.0
-        return np.asarray(away_x > wide[:, None])
+        is_lit = np.asarray(away_x <= wide[:, None])
+        beyond = (squares.side_px - self._units.side_px) // 2
+        if beyond > 0:  # the square is wider than the sprite, for what `exact` may light
+            inside = np.zeros(squares.side_px, dtype=np.bool_)
+            inside[beyond:-beyond] = True
+            is_lit &= inside[:, None, None] & inside[:, None]
+        return is_lit
 
     def _encode(self, plane: int) -> None:
         """Make levels of a plane's sums where they light a pixel."""
@@ -288,8 +294,9 @@ def _blacken(image: npt.NDArray[Any], place: IntArray | None) -> None:
     """Make an image (pixels, planes) black at these places; None for everywhere."""
     if place is None:
         image.fill(0)
-    else:
-        image[place] = 0
+        return
+    for plane in range(image.shape[1]):  # both indices at once take twice as long
+        image[:, plane][place] = 0
 
 
 class CpuImage:
@@ -310,7 +317,7 @@ class CpuImage:
         """Draw the light of sprites (None: none) in place of the last ones', within squares of
         these sides (n,), by default all of their footprints.
         """
-        _blacken(self._light, self._drawn)
+        _blacken(self._light[:, None], self._drawn)
         self._drawn = NOWHERE
         if sprites is None or not len(sprites):
             return

@@ -534,6 +534,8 @@ class Renderer(Backend):
             return self._exact_levels
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
+        if self._levels.in_memory:  # nothing of them is left to draw
+            return self._levels.read()
         with self._ctx:
             self._driver.wait()
             return self._levels.read()

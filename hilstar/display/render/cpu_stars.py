@@ -59,9 +59,9 @@ def squares_of(
     """The squares of sprites of these sides (n,), chunk by chunk."""
     order = np.argsort(side_px.astype(np.uint16), kind="stable")
     # column by column: a fancy index of records takes three times as long
-    words = words_of(sprites).take(order, axis=0).T
-    x, y = words[:2].astype(np.intp)
-    fraction_px = np.ascontiguousarray(words[2:]).view(np.float32)
+    columns = words_of(sprites).take(order, axis=0).T
+    x, y = columns[:2].astype(np.intp)
+    fraction_px = np.ascontiguousarray(columns[2:]).view(np.float32)
     begin = 0
     for side, count in groups_of(side_px):
         at_once = max(1, CHUNK_PX // side**2)
@@ -186,12 +186,12 @@ class CpuStars:
         side_px = self._sides_px(reach_px)
         rates = self._rates(sprites)
         is_listed = int((side_px**2).sum()) <= MAX_LISTED * len(self._levels)
-        found = []
+        places = []
         for squares in squares_of(sprites, side_px, self._size_px):
             self._add(squares, rates, reach_px[:, squares.some])
             if is_listed:
-                found.append(squares.place.ravel())
-        self._drawn = np.concatenate([NOWHERE, *found]) if is_listed else None
+                places.append(squares.place.ravel())
+        self._drawn = np.concatenate([NOWHERE, *places]) if is_listed else None
 
     def encode(self) -> None:
         """Make levels of the sums, the nearest."""
@@ -223,10 +223,10 @@ class CpuStars:
     def _rates(self, sprites: FrameLight) -> list[Float32Array]:
         """The rates (n,) of sprites in the units of each plane."""
         if self._planes.apart:
-            each = [sprites.data["primaries_e_per_s"][:, plane] for plane in range(self._count)]
+            light = list(sprites.data["primaries_e_per_s"].T)
         else:
-            each = [sprites.data["electrons_per_s"]]
-        units = zip(each, self.unit_e_per_s, strict=True)
+            light = [sprites.data["electrons_per_s"]]
+        units = zip(light, self.unit_e_per_s, strict=True)
         return [rate * np.float32(1 / unit_e_per_s) for rate, unit_e_per_s in units]
 
     def _add(self, squares: Squares, rates: list[Float32Array], reach_px: Float32Array) -> None:
@@ -325,7 +325,7 @@ class CpuImage:
             side_px = np.full(len(sprites), self._psf.footprint_px)
         is_listed = int((side_px**2).sum()) <= MAX_LISTED * len(self._light)
         rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
-        found = []
+        places = []
         for squares in squares_of(sprites, side_px, self._size_px):
             rate = rates[squares.some]
             light = self._psf.drawn_stamps(
@@ -336,8 +336,8 @@ class CpuImage:
             place = squares.place.ravel()
             np.add.at(self._light, place, light.ravel())
             if is_listed:
-                found.append(place)
-        self._drawn = np.concatenate([NOWHERE, *found]) if is_listed else None
+                places.append(place)
+        self._drawn = np.concatenate([NOWHERE, *places]) if is_listed else None
 
 
 def least_side_px(psf: Psf) -> int:

@@ -58,7 +58,7 @@ def squares_of(
 ) -> Iterator[Squares]:
     """The squares of sprites of these sides (n,), chunk by chunk."""
     order = np.argsort(side_px.astype(np.uint16), kind="stable")
-    # column by column: a fancy index of records takes three times as long
+    # by rows of words, for records are slow to index
     columns = words_of(sprites).take(order, axis=0).T
     x, y = columns[:2].astype(np.intp)
     fraction_px = np.ascontiguousarray(columns[2:]).view(np.float32)
@@ -146,8 +146,9 @@ class CpuStars:
         self._gain = None if gain is None else gain.ravel()
         self._most_gain = 1.0 if gain is None else float(gain.max())
         edges = [RoundQuantiser.edges_e_per_s(panel) for panel in planes.panels]
-        self._counters = [ThresholdCounter(one) for one in edges]
-        self._dark_e_per_s = [float(one[0]) / self._most_gain * (1 - 1e-6) for one in edges]
+        self._counters = [ThresholdCounter(thresholds) for thresholds in edges]
+        lowest = [float(thresholds[0]) for thresholds in edges]
+        self._dark_e_per_s = [light / self._most_gain * (1 - 1e-6) for light in lowest]
         self._level_light = planes.panels[0].light_e_per_s()
         self._margin_px = np.array(planes.margin_px, dtype=np.float32)
         self._axes_px2 = np.array(units.axes_px2, dtype=np.float32)

@@ -144,9 +144,6 @@ void leave(int i, Sums sums) {
 void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i >= count) return;
-#ifdef APART
-    is_alone = i < alone;
-#endif
 #ifndef PATHS
     i = turn[i];
 #endif

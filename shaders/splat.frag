@@ -1,8 +1,8 @@
 #version 330 core
 // A star's light in one pixel, with APART that of each primary, whose light lies at its place from the star. It comes after
 // shares.glsl.
-// With UNITS it is a whole number of units, within the ellipse that the star lights, as in light.comp: float32 holds the sum of
-// such lights exactly up to 2^24 units, so the codes are those of the star-by-star passes.
+// With UNITS it is a whole number of units, within the ellipse that the star lights, as in hilstar/display/render/cpu_stars.py:
+// float32 holds the sum of such lights exactly up to 2^24 units, so the codes are those of the CPU.
 
 flat in ivec2 star_pixel;
 flat in vec2 star_fraction_px;
@@ -16,7 +16,7 @@ uniform float most_e_per_s[PLANES];  // maximum light of one star in one pixel: 
 
 const float LEAST_PX = 1e-6;
 
-// As the loops of light.comp, operation by operation: codes are compared with its codes.
+// As cpu_stars.py, operation by operation: codes are compared with its codes.
 bool within_reach(ivec2 offset) {
     vec2 all_px = star_reach_px + margin_px;
     int first_y = int(ceil(star_fraction_px.y - all_px.y)), last_y = int(floor(star_fraction_px.y + all_px.y));

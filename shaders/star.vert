@@ -18,7 +18,7 @@ uniform int sides;
 uniform int side_px[MAX_SIDES];
 uniform float below_e_per_s[MAX_SIDES];
 uniform float sprites_per_star;
-// With reach_per_e above 0 a sprite is instead as large as the ellipse that the star lights, and largest_px at most (see light.comp).
+// With reach_per_e above 0 a sprite is instead as large as the ellipse that the star lights, and largest_px at most (see splat.frag).
 uniform float reach_per_e;
 uniform vec2 reach_px2;
 uniform int largest_px;

@@ -97,7 +97,7 @@ class ExactQuantiser(quantise.Quantiser):
         " single frame."
     )
     shader = "exact.comp"
-    other_codes = 5e-3
+    other_codes = 1e-2
     weights: ClassVar[Weights] = IN_A_FRAME
     remembers: ClassVar[bool] = False
     left: Left | None = None

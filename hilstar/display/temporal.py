@@ -37,6 +37,7 @@ class TemporalQuantiser(ExactQuantiser):
         "and so that each frame makes up for what the one before left, by which the mean of any N"
         " frames is about N times as right."
     )
+    other_codes = 0.35
     weights = OVER_FRAMES
     remembers = True
 

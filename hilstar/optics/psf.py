@@ -38,6 +38,25 @@ MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
 FIT_PLACES, FIT_ROUNDS = 120, 15
 BOUND_PLACES = 200
+# The rational approximation of erf in shaders/shares.glsl, above and below the line, the highest
+# power first.
+ERF_REACH = 4.0
+ERF_ABOVE = (
+    -2.72614225801306e-10,
+    2.77068142495902e-08,
+    -2.10102402082508e-06,
+    -5.69250639462346e-05,
+    -7.34990630326855e-04,
+    -2.95459980854025e-03,
+    -1.60960333262415e-02,
+)
+ERF_BELOW = (
+    -1.45660718464996e-05,
+    -2.13374055278905e-04,
+    -1.68282697438203e-03,
+    -7.37332916720468e-03,
+    -1.42647390514189e-02,
+)
 # A sampled PSF. Its footprint leaves out so much of its light at the worst phase; what is left is
 # scaled to the star's rate.
 MAX_SAMPLED_CUT = 1e-4
@@ -136,6 +155,14 @@ class Psf(ABC):
         `fraction_px` (2, n) is each star's x and y from the middle of its pixel, which is the
         (side - 1) // 2-th of its square.
         """
+
+    def drawn_stamps(
+        self, fraction_px: Float32Array, rates: Float32Array, side_px: int, footprint_px: int
+    ) -> Float32Array:
+        """As `stamps`, of rates in any unit, by the arithmetic of `shader` for a footprint that
+        holds all of these pixels.
+        """
+        return self.stamps(fraction_px.astype(np.float64), rates, side_px)
 
     @abstractmethod
     def spread(
@@ -237,6 +264,17 @@ class GaussianPsf(Psf):
         )
         down *= electrons_per_s
         return np.asarray(across.astype(np.float32)[None] * down.astype(np.float32)[:, None])
+
+    def drawn_stamps(
+        self, fraction_px: Float32Array, rates: Float32Array, side_px: int, footprint_px: int
+    ) -> Float32Array:
+        """In float32, along x and along y."""
+        offset_px = (np.arange(side_px, dtype=np.float32) - (side_px - 1) // 2)[:, None]
+        sigma_x, sigma_y = self.sigma_px
+        across = shader_shares(offset_px - fraction_px[0], sigma_x, footprint_px)
+        down = shader_shares(offset_px - fraction_px[1], sigma_y, footprint_px)
+        down *= rates
+        return across[None] * down[:, None]
 
     def spread(
         self,
@@ -620,7 +658,36 @@ def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
     return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
 
 
-@lru_cache(maxsize=8)
+def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -> Float32Array:
+    """As `pixel_shares`, by the arithmetic of shaders/shares.glsl: (side, n) of pixels in rows of a
+    pixel's step, within a footprint.
+    """
+    powers = share_polynomial(sigma_px, footprint_px / 2 + 0.5)
+    if powers is None:
+        edges = np.concatenate([offset_px - np.float32(0.5), offset_px[-1:] + np.float32(0.5)])
+        edges *= np.float32(1 / (sigma_px * SQRT2))
+        share: Float32Array = np.diff(_shader_erf(edges), axis=0)
+        return np.maximum(share, 0) * np.float32(0.5)
+    square = offset_px * offset_px
+    log2 = np.full_like(square, powers[-1])
+    for power in reversed(powers[:-1]):
+        log2 *= square
+        log2 += np.float32(power)
+    return np.exp2(log2, out=log2)
+
+
+def _shader_erf(value: Float32Array) -> Float32Array:
+    x = np.clip(value, np.float32(-ERF_REACH), np.float32(ERF_REACH))
+    square = x * x
+    above, below = np.full_like(x, ERF_ABOVE[0]), np.full_like(x, ERF_BELOW[0])
+    for sum_, terms in ((above, ERF_ABOVE), (below, ERF_BELOW)):
+        for term in terms[1:]:
+            sum_ *= square
+            sum_ += np.float32(term)
+    return x * above / below
+
+
+@lru_cache(maxsize=16)
 def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | None:
     """Coefficients, constant first, of log2 of a pixel's share as a polynomial of its distance
     squared (px^2).

@@ -205,7 +205,7 @@ def _gl() -> str:
         return described()
     except MachineError as error:
         until_then = (
-            "until then NumPy draws frame, simulate and verify, slower; serve, replay and demo need"
+            "until then the processor draws frame, simulate and verify; serve, replay and demo need"
             " OpenGL"
         )
         raise MachineError(f"{error}; {until_then}") from error

@@ -8,7 +8,7 @@
 #define BITS uvec4
 #endif
 
-layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as in light.comp
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as SPRITE_DTYPE, and each plane's light
 // A footprint's pixels by distance, for each phase: in a block where there is room, as the light of levels in floor.glsl.
 #ifdef ORDER_ROWS
 layout(std140, binding = 1) uniform Order { uvec4 order_rows[ORDER_ROWS]; };
@@ -45,7 +45,6 @@ uniform sampler2D gain;
 #endif
 
 uniform int count;
-uniform int alone;     // of primaries, stars whose pixels no other star lights, the first in their order: there are no sums of them
 uniform int footprint;  // pixels in all
 uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in footprints.py
 uniform int fewest;

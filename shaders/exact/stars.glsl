@@ -148,18 +148,11 @@ float path_light_at(vec2 offset) {
 }
 #endif
 
-#ifdef APART
-bool is_alone;
-#else
-const bool is_alone = false;
-#endif
-
 // The light that a pixel should show, e-/s, negative where it is not this star's; `own` is what the star gives.
 float asked_of(ivec2 at, float own) {
     if (!on_image(at)) return -1.0;
 #ifdef SUMS
-    int units = int(own / unit_e_per_s[PLANE] + 0.5);
-    if (!is_alone) units = sums[PLANES * (at.y * resolution_px.x + at.x) + PLANE];
+    int units = sums[PLANES * (at.y * resolution_px.x + at.x) + PLANE];
     float drawn = float(units) * unit_e_per_s[PLANE];
 #else
     float drawn = imageLoad(linear_e_per_s, at)[PLANE];

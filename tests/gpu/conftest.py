@@ -1,13 +1,14 @@
-"""The two ways in which a software OpenGL draws levels: star by star, as it does, and by points,
-as a graphics card does.
+"""The ways of drawing stars that a test asks for; without one it is HILSTAR_DRAW's, or the
+machine's own.
 """
 
 from __future__ import annotations
 
 import pytest
 
+from hilstar.display.render.backend import WAY_VARIABLE
 from hilstar.display.render.context import gpus
-from hilstar.display.render.star_passes import LightUnits
+from hilstar.display.render.light_units import LightUnits
 
 
 @pytest.fixture
@@ -21,22 +22,19 @@ def on_llvmpipe() -> None:
 
 @pytest.fixture
 def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sprites are rasterised and blended."""
-    monkeypatch.setattr(
-        "hilstar.display.render.renderer.computes_in_software", lambda context: False
-    )
+    """Sprites are rasterised and blended, as by a graphics card."""
+    monkeypatch.setenv(WAY_VARIABLE, "gl")
 
 
 @pytest.fixture
-def in_no_units(monkeypatch: pytest.MonkeyPatch) -> None:
+def by_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy draws the lit pixels of stars, whatever the OpenGL."""
+    monkeypatch.setenv(WAY_VARIABLE, "cpu")
+
+
+@pytest.fixture
+def in_no_units(by_points: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sprites are blended as they are, as in frames with extended light: the image that is read
     is the one that is encoded.
     """
-    monkeypatch.setattr(LightUnits, "takes", staticmethod(lambda *target: False))
-
-
-@pytest.fixture(params=["star by star", "by points"])
-def each_way(request: pytest.FixtureRequest) -> None:
-    """Once in each of the two ways."""
-    if request.param == "by points":
-        request.getfixturevalue("by_points")
+    monkeypatch.setattr(LightUnits, "unit_for", lambda units, sprites: None)

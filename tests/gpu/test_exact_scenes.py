@@ -33,8 +33,6 @@ from tests.support.exact_scenes import (
     uneven,
 )
 
-pytestmark = pytest.mark.usefixtures("each_way")
-
 # Pixels that differ from the oracle's: of two choices that are as good it may take the other, and
 # on 2 bits many are. Where stars lie over each other a pixel that is nobody's by half stays
 # rounded, which in NumPy the brighter one chooses.

@@ -76,7 +76,6 @@ def test_a_map_is_added_to_the_stars_encoded_whole_and_gone_in_the_next_frame(me
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
-@pytest.mark.usefixtures("each_way")
 @pytest.mark.parametrize("uneven", [False, True])
 def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
     """A star's light is the difference to the floor's; without light of its own a floor is that

@@ -1,4 +1,4 @@
-"""NumPy draws what OpenGL draws: eleven benches, three frames of each."""
+"""NumPy draws what OpenGL draws by points: eleven benches, three frames of each."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from hilstar.basics.units import NS_PER_S
 from hilstar.display.quantise import shown_light
 from hilstar.display.render.numpy_backend import NumpyBackend
 from tools import same_codes
+
+pytestmark = pytest.mark.usefixtures("by_points")  # on the CPU both are the same code
 
 EVERY, FRAMES = 4, 3  # of a log of ten attitudes: of bodies one before each of three
 LINEAR = 1e-6  # of a frame's brightest pixel, from stars: float32 and the GPU's erf

@@ -93,7 +93,6 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     assert levels.max() == response.white
 
 
-@pytest.mark.usefixtures("each_way")
 def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
     """Groups of faint stars and bright ones: a star's light beyond its square is under a 32nd of
     what lights a pixel.
@@ -116,7 +115,6 @@ def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
 
 
 @pytest.mark.parametrize("sigma", [(0.55, 0.55), (0.85, 0.85), (1.3, 0.7)])
-@pytest.mark.usefixtures("each_way")
 def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
     """At 144 phases, from one that lights no pixel to one that clips."""
     step = GaussianPsf(sigma).footprint_px + 3
@@ -151,7 +149,6 @@ def apart(count, rng, footprint):
 
 @pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES)
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
-@pytest.mark.usefixtures("each_way")
 def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
     target = target_of(response, "exact", uneven(rng) if mapped else None)
     panel = target.panel()
@@ -177,7 +174,6 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
-@pytest.mark.usefixtures("each_way")
 def test_exact_paths_are_those_of_its_quantiser(rng):
     """Streaks of up to 70 sprites, some over the edge: the same flux within a step of each, and
     as good.
@@ -213,7 +209,6 @@ def test_exact_paths_are_those_of_its_quantiser(rng):
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
-@pytest.mark.usefixtures("each_way")
 def test_overlapping_stars_are_exact_together(rng):
     """2000 stars over each other: light as right as that of the oracle, rounding is off by much
     more.
@@ -240,7 +235,6 @@ def test_overlapping_stars_are_exact_together(rng):
     assert rms[0] < 0.7 * rms[2]
 
 
-@pytest.mark.usefixtures("each_way")
 def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
     """A number not above the last one's, `begin_anew` and a blank frame begin a sequence; other
     drawings do not.

@@ -30,8 +30,8 @@ PIXEL_LIMIT = 2 * 4.4e-7
 BLEND_LIMIT = 1e-6
 
 
-# A linear image beside codes is rasterised; alone, it is added up in the process's memory where
-# this GL can (host_image.py).
+# A linear image beside codes is rasterised; alone, it is drawn on the CPU where that draws stars
+# (cpu_stars.py).
 BOTH_WAYS = pytest.mark.parametrize("bits", [8, None], ids=["beside codes", "alone"])
 
 
@@ -207,7 +207,6 @@ def test_nothing_remains_of_the_frame_before(rng):
 
 
 @pytest.mark.parametrize("read", [False, True], ids=["unread", "light is read between"])
-@pytest.mark.usefixtures("each_way")
 def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
     """Few are erased one by one, more by a clear, and those that cover the image by the pass
     itself.
@@ -223,8 +222,8 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
                 gl.linear()
             fresh.draw(None)
             fresh._last_count = None  # all of its images is cleared
-            if fresh._passes is not None:
-                fresh._passes.forget()
+            if fresh._cpu_stars is not None:
+                fresh._cpu_stars.forget()
             fresh.draw(sprites)
             assert np.array_equal(gl.levels(), fresh.levels())
             if read:

@@ -168,7 +168,6 @@ def test_paths_keep_their_light_over_the_frames():
     assert max(errors) < AIM_MAG
 
 
-@pytest.mark.usefixtures("each_way")
 def test_frames_with_extended_light_go_on_where_others_stopped():
     """A map lights the image in every second frame, by points drawn by NumPy: the light of all
     is right within a step.

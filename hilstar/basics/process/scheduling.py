@@ -1,13 +1,7 @@
 """When and where the kernel runs what must not wait: the frame loop, a process that stamps
-arrivals, llvmpipe's threads.
+arrivals.
 
 `HostClock` waits for a moment of the host's clock.
-
-Mesa's llvmpipe begins as many threads as there are cores, once to rasterise and once to compute.
-They wait for work that takes a tenth of a millisecond, and Linux then often wakes two of them on
-one core. Frames of 1000 stars took 1.6 ms in place of 1.1 ms, of 10 000 stars 9 ms in place of 6.5
-(two cores, nothing else running); beside a busy process on each core they take the same time. So
-each thread is kept on a core of its own.
 """
 
 import contextlib
@@ -37,12 +31,6 @@ SHORT_SLICE_NS = 100_000  # the shortest that the kernel gives
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 # sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period
 SCHED_ATTRIBUTES = struct.Struct("=IIQiIQQQ")
-TASKS = Path("/proc/self/task")
-RASTERISERS = "llvmpipe-"
-NAMING_LOOK_S = 1e-3
-# A thread names itself, a little after it has begun: on a busy machine, when it is first given a
-# core.
-NAMING_S, BUSY_NAMING_S = 0.02, 0.5
 
 MAX_WAIT_S = 3600.0  # the platform's own limit is some centuries; a longer wait is done in parts
 # An event wakes up to 0.1 ms late, and the thread then waits for Python's lock: the last of a wait
@@ -279,56 +267,3 @@ def _set_all_threads(policy: int, priority: int) -> bool:
     except (OSError, AttributeError):
         return False
     return True
-
-
-@contextmanager
-def drawing_threads_apart() -> Iterator[None]:
-    """Pin each thread that llvmpipe starts in this context to its own core, where it starts one
-    per core.
-    """
-    before = _threads()
-    yield
-    begun_s = time.monotonic()
-    while True:
-        begun = {
-            thread: name for thread, name in sorted(_threads().items()) if thread not in before
-        }
-        rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
-        # Those that compute have the process's own name; others of the driver's have one with a
-        # colon.
-        computing = [
-            thread
-            for thread, name in begun.items()
-            if thread not in rasterisers and ":" not in name
-        ]
-        if len(rasterisers) == len(computing):
-            break
-        may_be_llvmpipe = len(rasterisers) + len(computing) >= 2 * len(_cores())
-        if time.monotonic() - begun_s > (BUSY_NAMING_S if may_be_llvmpipe else NAMING_S):
-            break
-        time.sleep(NAMING_LOOK_S)
-    for group in (rasterisers, computing):
-        if len(group) == len(rasterisers):
-            _spread(group)
-
-
-def _threads() -> dict[int, str]:
-    names: dict[int, str] = {}
-    with contextlib.suppress(OSError):
-        for task in TASKS.iterdir():
-            with contextlib.suppress(OSError):  # it has ended
-                names[int(task.name)] = (task / "comm").read_text().strip()
-    return names
-
-
-def _cores() -> list[int]:
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-
-
-def _spread(threads: list[int]) -> None:
-    cores = _cores()
-    if len(threads) < 2 or len(threads) != len(cores):
-        return
-    for thread, core in zip(threads, cores, strict=True):
-        with contextlib.suppress(OSError):  # it has ended, or may not be told
-            os.sched_setaffinity(thread, {core})

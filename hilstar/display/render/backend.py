@@ -5,6 +5,7 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 OpenGL.
 """
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,13 @@ if TYPE_CHECKING:
 EGL_LIBRARY = "libEGL.so.1"
 NO_FRAME = -1  # before the first frame of a sequence
 MAX_SIDES = 8  # as in star.vert
-Path = Literal["compute shaders", "points", "points, then compute shaders", "NumPy"]
+# what draws levels: "CPU" is `cpu_stars`, and "NumPy" the quantisers' own code, star by star
+Path = Literal[
+    "CPU", "CPU, then compute shaders", "points", "points, then compute shaders", "NumPy"
+]
+WAY_VARIABLE = "HILSTAR_DRAW"
+Way = Literal["gl", "cpu"]
+WAYS: tuple[Way, ...] = ("gl", "cpu")
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +180,19 @@ class ScreenView:
     orientation: Orientation = field(default_factory=Orientation)
     cross_px: tuple[float, float] = (0.0, 0.0)
     triples: npt.NDArray[np.uint16] | None = None
+
+
+def wanted_way() -> Way | None:
+    """The way of drawing stars that HILSTAR_DRAW wants, None for the machine's own. InputError for
+    another word.
+    """
+    wanted = os.environ.get(WAY_VARIABLE, "")
+    if not wanted:
+        return None
+    for way in WAYS:
+        if wanted == way:
+            return way
+    raise InputError(f"{WAY_VARIABLE}={wanted}: no way to draw stars; write {' or '.join(WAYS)}")
 
 
 class Backend(ABC):

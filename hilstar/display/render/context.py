@@ -13,17 +13,15 @@ import numpy.typing as npt
 from glcontext import egl
 
 from hilstar.basics.errors import InputError, MachineError, NotThereError, did_you_mean
-from hilstar.basics.process.scheduling import drawing_threads_apart
 from hilstar.basics.units import GL_VERSIONS
 from hilstar.display.exact import COMPUTE_VERSION
-from hilstar.display.render.backend import EGL_LIBRARY
+from hilstar.display.render.backend import EGL_LIBRARY, wanted_way
 
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 Context = moderngl.Context
-SOFTWARE = ("llvmpipe", "softpipe")
-# llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535
-# end them without a word).
-MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
+# parts of a GL_RENDERER; zink names the Vulkan that it draws by, "zink Vulkan 1.3(llvmpipe ...)"
+SOFTWARE = ("llvmpipe", "softpipe", "lavapipe")
+MAX_WRITTEN_BYTES = 2**27  # what llvmpipe's shaders write of a buffer at most
 MAX_GPUS = 32
 PINNED_MEMORY = "GL_AMD_pinned_memory"
 # constants of that extension and of OpenGL
@@ -96,21 +94,20 @@ def create_context(gpu: int | str | None = None) -> moderngl.Context:
 def _context_on(index: int | None) -> moderngl.Context:
     settings: Any = {"libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
     refusal = ""
-    with drawing_threads_apart():
-        for major, minor in GL_VERSIONS:
-            version = 100 * major + 10 * minor
-            try:
-                if index is None:
-                    return moderngl.create_context(
-                        require=version, standalone=True, **settings | {"backend": "egl"}
-                    )
-                # moderngl's own way to an index gives way to a variable of the environment.
-                on_device = egl.create_context(
-                    glversion=version, mode="standalone", device_index=index, **settings
+    for major, minor in GL_VERSIONS:
+        version = 100 * major + 10 * minor
+        try:
+            if index is None:
+                return moderngl.create_context(
+                    require=version, standalone=True, **settings | {"backend": "egl"}
                 )
-                return moderngl.create_context(require=version, standalone=True, context=on_device)
-            except Exception as error:  # moderngl and glcontext raise plain Exceptions here
-                refusal = str(error)
+            # moderngl's own way to an index gives way to a variable of the environment.
+            on_device = egl.create_context(
+                glversion=version, mode="standalone", device_index=index, **settings
+            )
+            return moderngl.create_context(require=version, standalone=True, context=on_device)
+        except Exception as error:  # moderngl and glcontext raise plain Exceptions here
+            refusal = str(error)
     raise MachineError(f"OpenGL 3.3 through EGL is missing ({refusal}); {INSTALL_EGL}")
 
 
@@ -130,10 +127,8 @@ def described() -> str:
             if ctx.version_code >= COMPUTE_VERSION
             else "NumPy (slow: their shaders need OpenGL 4.3)"
         )
-        return (
-            f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'},"
-            f" exact and temporal by {exact}"
-        )
+        stars = "CPU" if draws_by_cpu(ctx) else "points"
+        return f"{what}; round by {stars}, exact and temporal by {exact}"
     finally:
         ctx.release()
 
@@ -159,10 +154,16 @@ def check_limits(
         )
 
 
-def computes_in_software(ctx: moderngl.Context) -> bool:
-    """Whether this GL is a processor's, with compute shaders in the process's own memory; cards
-    rasterise in their stride.
+def draws_by_cpu(ctx: moderngl.Context) -> bool:
+    """Whether stars are drawn by `cpu_stars` beside this GL: HILSTAR_DRAW, else where it is a
+    processor's, too.
     """
+    wanted = wanted_way()
+    return is_software(ctx) if wanted is None else wanted == "cpu"
+
+
+def shares_memory(ctx: moderngl.Context) -> bool:
+    """Whether this GL's compute shaders read and write the process's own memory."""
     return (
         bool(ctx.version_code >= COMPUTE_VERSION)
         and is_software(ctx)
@@ -172,7 +173,8 @@ def computes_in_software(ctx: moderngl.Context) -> bool:
 
 def is_software(ctx: moderngl.Context) -> bool:
     """Whether a processor draws, and no graphics card."""
-    return str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
+    renderer = str(ctx.info["GL_RENDERER"])
+    return any(name in renderer for name in SOFTWARE)
 
 
 def pinned(

@@ -5,9 +5,7 @@ Primaries that are driven apart are planes of one image, whose pixels and sprite
 each (`Planes`).
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -20,12 +18,13 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import held
 from hilstar.basics.resources import resource_path
 from hilstar.display.quantise import Panel, PixelQuantiser, code_table, level_dtype
-from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
-from hilstar.display.render.context import computes_in_software, is_software, pinned
+from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides
+from hilstar.display.render.context import is_software, pinned, shares_memory
+from hilstar.display.render.light_units import Planes
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
+from hilstar.optics.sprites import FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Tiles
@@ -83,90 +82,17 @@ def set_uniforms(
             program[name] = value
 
 
-@dataclass(frozen=True, slots=True)
-class Planes:
-    """The planes of an image: one, or one for each of the primaries that a target drives apart.
-
-    `panels` are theirs, `share` (planes,) what of white's light each has, and `footprint_px` the
-    side of sprites that hold the light of all: it lies up to `margin_px` from the star.
+def set_planes(
+    planes: Planes, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]
+) -> None:
+    """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop what
+    it does not need.
     """
-
-    panels: tuple[Panel, ...]
-    share: tuple[float, ...]
-    footprint_px: int
-    margin_px: tuple[float, float]
-    defines: tuple[str, ...]
-    places_px: list[tuple[float, float]]
-
-    @classmethod
-    def of(cls, target: Target) -> "Planes":
-        """Those of a target."""
-        white_e_per_s, panel = target.flux_at_white_e_per_s, target.panel()
-        panels = target.primaries or (() if panel is None else (panel,))
-        away = np.abs(np.array(target.places_px)).max(axis=0) if target.primaries else np.zeros(2)
-        defines = ["APART"] * bool(target.primaries) + ["OFFSETS"] * bool(away.any())
-        share = tuple(one.flux_at_white_e_per_s / white_e_per_s for one in panels)
-        margin_px = float(away[0]), float(away[1])
-        side_px = target.psf.footprint_px + 2 * math.ceil(max(margin_px))
-        return cls(
-            panels,
-            share,
-            side_px,
-            margin_px,
-            tuple(defines),
-            [(float(x), float(y)) for x, y in target.places_px],
-        )
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """A sprite's: SPRITE_DTYPE, with the light of each primary after it."""
-        return APART_DTYPE if self.apart else SPRITE_DTYPE
-
-    @property
-    def apart(self) -> bool:
-        """Whether there is a plane for each primary."""
-        return len(self.panels) > 1
-
-    @property
-    def texel(self) -> int:
-        """Components of a texel."""
-        return 4 if self.apart else 1
-
-    @property
-    def lit(self) -> Panel:
-        """A grey panel whose first level takes as little light as that of any plane."""
-        first, share = min(
-            zip(self.panels, self.share, strict=True),
-            key=lambda one: float(one[0].response.threshold[0]),
-        )
-        return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
-
-    def packed(self, sprites: FrameLight) -> FrameLight:
-        """Sprites with `dtype`; their rate is then that of the white that they need for the
-        primary that needs most.
-        """
-        if not self.apart or sprites.primaries is None:
-            return sprites
-        data = np.empty(len(sprites), dtype=APART_DTYPE)
-        words = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
-        words[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
-        data["primaries_e_per_s"] = sprites.primaries
-        data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(
-            axis=1
-        )
-        return replace(sprites, data=data)
-
-    def set(
-        self, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]
-    ) -> None:
-        """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop
-        what it does not need.
-        """
-        for name, each in (values | {"places_px": self.places_px}).items():
-            if name in program:  # an array ends with its last element that is used
-                length = getattr(program[name], "array_length", 1)
-                program[name] = list(each[:length]) if length > 1 else each[0]
-        set_uniforms(program, {"margin_px": self.margin_px})
+    for name, each in (values | {"places_px": planes.places_px}).items():
+        if name in program:  # an array ends with its last element that is used
+            length = getattr(program[name], "array_length", 1)
+            program[name] = list(each[:length]) if length > 1 else each[0]
+    set_uniforms(program, {"margin_px": planes.margin_px})
 
 
 class Shares:
@@ -207,7 +133,7 @@ def splat_program(
     defines = (*planes.defines, *shares.defines, *["UNITS"] * in_units)
     program = build_program(ctx, "star.vert", "splat.frag", defines, ("planes.glsl", "shares.glsl"))
     shares.set(program)
-    planes.set(program)
+    set_planes(planes, program)
     program["resolution_px"] = resolution_px
     program["footprint_px"] = shares.footprint_px
     return program
@@ -225,7 +151,6 @@ def sprites_array(
 
 
 MAX_RATE = 3e38  # in float32
-APART_DTYPE = np.dtype([*SPRITE_DTYPE.descr, ("primaries_e_per_s", "<f4", 3)])
 # star.vert's
 INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}
 # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6
@@ -400,7 +325,7 @@ class LevelTexture:
         kind, self._components = level_dtype(planes.panels[0].response), planes.texel
         shape = height, width, planes.texel
         made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
-        self.image, self.memory = pinned(ctx, shape, kind) if computes_in_software(ctx) else made
+        self.image, self.memory = pinned(ctx, shape, kind) if shares_memory(ctx) else made
         self._levels = Levels(
             self.image[..., : len(planes.panels)] if planes.apart else self.image[..., 0]
         )
@@ -569,7 +494,7 @@ class Encoder:
                 defines=(*self._defines, *(of_tiles or self._of_image)),
                 include=include,
             )
-            self._planes.set(program, bins=self._bins[0], thresholds=self._bins[1])
+            set_planes(self._planes, program, bins=self._bins[0], thresholds=self._bins[1])
             if "Edges" in program:
                 cast(moderngl.UniformBlock, program["Edges"]).binding = 1
             set_uniforms(program, {name: unit for unit, name in enumerate(self._textures)})

@@ -11,22 +11,23 @@ import moderngl
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import IntArray
+from hilstar.basics.arrays import Float32Array, IntArray
 from hilstar.display.balance import SUMS, Balance
 from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
 from hilstar.display.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.display.render.backend import Target, Turn
+from hilstar.display.render.context import pinned
 from hilstar.display.render.encoder import (
     LevelTexture,
     LookupTable,
-    Planes,
     Shares,
     build_compute,
     linear_format,
+    set_planes,
     set_uniforms,
     write,
 )
-from hilstar.display.render.star_passes import TURNS_BINDING, StarPasses, turns_of
+from hilstar.display.render.light_units import Planes
 from hilstar.display.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.optics.psf import PIXEL_VARIANCE
 from hilstar.optics.sprites import FrameLight
@@ -41,9 +42,45 @@ PARTS = tuple(
     for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")
 )
 LOCAL_SIZE = 32  # as in exact.comp
+TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 3, 7, 8
+# runs of stars are sorted by light; runs times half octaves fill 16 bits
+RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32
 FIRST_BINDING = 4  # first binding of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
 SUMS_BYTES = 4 * SUMS
+
+
+class PixelSums:
+    """What the shaders see of stars that `cpu_stars` draws: sprites, pixels' sums and levels.
+
+    `values` int32 (n,) are the sums, in memory that this GL shares. It lives in its renderer's
+    context, which is current in every call.
+    """
+
+    def __init__(self, planes: Planes, levels: LevelTexture) -> None:
+        ctx = levels.texture.ctx
+        self._planes, self._levels = planes, levels
+        count = math.prod(levels.texture.size) * len(planes.panels)
+        self.values, self._memory = pinned(ctx, (count,), np.int32)
+        self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
+        self.floor: LevelTexture | None = None
+        self._unit_e_per_s: list[float] = []
+
+    def upload(
+        self, sprites: FrameLight, unit_e_per_s: list[float], floor: LevelTexture | None
+    ) -> None:
+        """Take the sprites of a frame, the units of its sums, and the floor that it stands on."""
+        write(self.sprites, sprites.data)
+        self._unit_e_per_s, self.floor = unit_e_per_s, floor
+
+    def bind(self, program: moderngl.ComputeShader) -> None:
+        """Let a program look at the sums (see shaders/sums.glsl) and change levels."""
+        set_planes(self._planes, program, unit_e_per_s=self._unit_e_per_s)
+        self._memory.bind_to_storage_buffer(SUMS_BINDING)
+        if self._levels.memory is not None:
+            self._levels.memory.bind_to_storage_buffer(LEVELS_BINDING)
+        if self.floor is not None:
+            self.floor.texture.bind_to_image(1, read=True, write=False)
 
 
 class ExactPass:
@@ -135,7 +172,7 @@ class ExactPass:
         files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
         program = build_compute(self._ctx, self._quantiser.shader, defines, files)
         self._shares.set(program)
-        self._planes.set(program, makes_up=self._makes_up)
+        set_planes(self._planes, program, makes_up=self._makes_up)
         window, weights = balance.window_px, balance.weights
         values: dict[str, Any] = {
             "footprint": order.size**2,
@@ -188,28 +225,25 @@ class ExactPass:
         ]
 
     def draw(
-        self, buffer: moderngl.Buffer, sprites: FrameLight, passes: StarPasses | None = None
+        self, buffer: moderngl.Buffer, sprites: FrameLight, sums: PixelSums | None = None
     ) -> None:
-        """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or
-        else the linear image.
+        """Choose the levels of `sprites`, which `buffer` holds and `sums` show, or else the linear
+        image.
         """
         paths = sprites.per_star > 1
-        program = self._program(
-            paths, passes is not None, passes is not None and passes.floor is not None
-        )
-        if passes is None:
+        on_floor = sums is not None and sums.floor is not None
+        program = self._program(paths, sums is not None, on_floor)
+        if sums is None:
             self._linear.bind_to_image(1, read=True, write=False)
         else:
-            passes.bind(program)
-        if paths or passes is None or not self._planes.apart:  # else `passes` have an order
-            turns = (
-                stretches_of(sprites.star)
-                if paths
-                else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
-            )
-            write(self._turns, turns.astype(np.int32))
-            self._turns.bind_to_storage_buffer(TURNS_BINDING)
-        count = len(turns) if paths else len(sprites)
+            sums.bind(program)
+        if paths:
+            turns = stretches_of(sprites.star)
+        else:
+            turns = turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
+        write(self._turns, turns.astype(np.int32))
+        self._turns.bind_to_storage_buffer(TURNS_BINDING)
+        count = len(turns)
         if self._memory is not None and paths:
             self._memory.bind(sprites.star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:
@@ -227,7 +261,7 @@ class ExactPass:
         program["count"] = count
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()
-        if passes is not None:
+        if sums is not None:
             self._ctx.finish()  # before NumPy looks at the levels
 
 
@@ -348,3 +382,24 @@ def stretches_of(star: IntArray) -> IntArray:
     return np.stack(
         [first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1
     )
+
+
+def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
+    """The order (n,) in which sprites go through the pass: in runs of near neighbours, each by
+    light.
+
+    Eight stars go together in a software OpenGL, for as long as the brightest of them needs. A
+    run's own pixels stay in the cache.
+    """
+    count = len(electrons_per_s)
+    runs = max(1, min(count // RUN, MAX_RUNS))
+    # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows
+    # by a pixel or two.
+    half_octaves = (electrons_per_s.view(np.int32) >> 22) - (
+        np.float32(step_e_per_s).view(np.int32) >> 22
+    )
+    key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(
+        half_octaves, 0, HALF_OCTAVES - 1
+    )
+    # 16-bit keys are sorted by radix
+    return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))

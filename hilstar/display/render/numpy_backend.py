@@ -1,8 +1,7 @@
-"""Frames drawn by NumPy where a machine has no OpenGL: the oracle of the GL renderer as a backend,
-slower.
+"""Frames drawn by NumPy where a machine has no OpenGL.
 
-The linear image is that of `reference` in float32, and the quantisers are those of `monitor`, which
-the shaders follow.
+Stars are those of `cpu_stars`; extended light is that of `reference` in float32, slower than
+OpenGL's. The quantisers are those that the shaders follow.
 """
 
 import ctypes
@@ -13,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import MachineError, NotThereError
-from hilstar.display.quantise import UnquantisedFrame
+from hilstar.display.quantise import UnquantisedFrame, level_dtype
 from hilstar.display.render.aids import LINE_SHARE, lay_over
 from hilstar.display.render.backend import (
     EGL_LIBRARY,
@@ -24,8 +23,11 @@ from hilstar.display.render.backend import (
     ScreenView,
     Target,
     as_maps,
+    wanted_way,
 )
-from hilstar.display.render.reference import add_stars, extended_image
+from hilstar.display.render.cpu_stars import CpuImage, CpuStars
+from hilstar.display.render.light_units import LightUnits, Planes
+from hilstar.display.render.reference import extended_image
 from hilstar.display.response import Levels
 from hilstar.optics.extended import ExtendedLight
 from hilstar.optics.sprites import FrameLight
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from moderngl import Context
 
 NUMPY = "NumPy"
+NO_OPENGL = "HILSTAR_DRAW=gl, and there is no OpenGL ({}); unset it, or see 'hilstar doctor'"
 log = logging.getLogger(__name__)
 
 
@@ -51,12 +54,15 @@ def headless_context(gpu: int | str | None = None) -> "Context | None":
     """A headless GL context on a GPU (see `create_context`); None where this machine has no OpenGL,
     so that NumPy draws.
 
-    Raises InputError where the machine has no such GPU.
+    Raises InputError where the machine has no such GPU, and MachineError where HILSTAR_DRAW=gl
+    wants one.
     """
     if gpu is None:
         try:
             ctypes.CDLL(EGL_LIBRARY)
-        except OSError:
+        except OSError as error:
+            if wanted_way() == "gl":
+                raise MachineError(NO_OPENGL.format(f"{EGL_LIBRARY} is missing")) from error
             _say_once(f"{EGL_LIBRARY} is missing")
             return None
     from hilstar.display.render.context import create_context  # moderngl
@@ -66,6 +72,8 @@ def headless_context(gpu: int | str | None = None) -> "Context | None":
     except NotThereError:  # a named one is meant, and no other draws in its place
         raise
     except MachineError as error:
+        if wanted_way() == "gl":
+            raise MachineError(NO_OPENGL.format(error)) from error
         _say_once(str(error))
         return None
 
@@ -73,7 +81,9 @@ def headless_context(gpu: int | str | None = None) -> "Context | None":
 @lru_cache(maxsize=1)
 def _say_once(why: str) -> None:
     log.warning(
-        "NumPy draws, slower than OpenGL would (%s); 'hilstar doctor' says what to install", why
+        "no OpenGL here (%s): the processor draws, discs and `exact` slower than OpenGL would;"
+        " 'hilstar doctor' says what to install",
+        why,
     )
 
 
@@ -87,11 +97,18 @@ class NumpyBackend(Backend):
     context = None
     gl_renderer = NUMPY
     gl_version = np.__version__
-    path = "NumPy"
 
     def __init__(self, target: Target) -> None:
         self.target = target
         self._quantisers = target.quantisers()
+        self.path = "NumPy"
+        self._stars: CpuStars | None = None
+        self._level_image = np.empty((0, 0, 0), dtype=np.uint8)
+        self._planes = Planes.of(target)
+        if self._planes.panels and target.quantisation == "round":
+            self.path = "CPU"
+            self._build_stars()
+        self._image_of_stars = CpuImage(target.resolution_px, target.psf)
         self._last_frame = NO_FRAME
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
         self._sprites: FrameLight | None = None
@@ -105,8 +122,32 @@ class NumpyBackend(Backend):
             self.begin_anew()
         self._last_frame = frame
         self._sprites, self._linear = sprites, None
+        if self._stars is not None and self._draws_stars_alone(self._stars, sprites):
+            return
         if self._quantisers:
             self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
+
+    def _build_stars(self) -> None:
+        """Make what draws the nearest levels of frames of stars alone."""
+        target, planes = self.target, self._planes
+        units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
+        shape = *target.resolution_px[::-1], len(planes.panels)
+        self._level_image = np.zeros(shape, dtype=level_dtype(planes.panels[0].response))
+        self._stars, self._units = CpuStars(units, self._level_image), units
+
+    def _draws_stars_alone(self, stars: CpuStars, sprites: FrameLight | None) -> bool:
+        """Whether the levels of a frame are those of stars alone, which are drawn then."""
+        light = as_maps(sprites, self.target)
+        if light is not None and light.extended:
+            return False
+        stars.lay(None)
+        if light is not None and len(light):
+            packed = self._planes.packed(light)
+            stars.add(packed, self._units.unit_for(packed))
+            stars.encode()
+        image = self._level_image
+        self._levels = Levels(image if self.target.primaries else image[..., 0])
+        return True
 
     def _plane(self, frame: int, k: int, light: FrameLight | None) -> Levels:
         image, alone = (
@@ -183,24 +224,26 @@ class NumpyBackend(Backend):
         """
         width, height = self.target.resolution_px
         sprites = as_maps(sprites, self.target) if stars else sprites
+        zeros = np.zeros((height, width), dtype=np.float32)
         if sprites is None:
-            return np.zeros((height, width), dtype=np.float32)
-        image = self._extended(sprites.extended, plane)
+            return zeros
+        extended = self._extended(sprites.extended, plane) if sprites.extended else None
         if not stars:
-            return image.astype(np.float32)
-        image = image.copy()
+            return zeros if extended is None else extended.astype(np.float32)
+        self._image_of_stars.draw(sprites, self._sides_px(sprites, shrunk, plane))
+        image = self._image_of_stars.image
+        return image if extended is None else (image + extended).astype(np.float32)
+
+    def _sides_px(self, sprites: FrameLight, shrunk: bool, plane: int) -> IntArray:
+        """The sides (n,) of the squares of sprites."""
         sides_px = np.full(len(sprites), self.target.psf.footprint_px)
         rate = sprites.data["electrons_per_s"] * sprites.per_star
         if self.target.primaries:
-            rate = rate * (
-                self.target.flux_at_white_e_per_s
-                / self.target.primaries[plane].flux_at_white_e_per_s
-            )
+            white_e_per_s = self.target.primaries[plane].flux_at_white_e_per_s
+            rate = rate * (self.target.flux_at_white_e_per_s / white_e_per_s)
         for side in self.target.sides if shrunk else ():
             sides_px[rate < side.below_e_per_s] = side.side_px
-        for side_px in np.unique(sides_px).tolist():
-            add_stars(image, sprites, self.target.psf, side_px, np.flatnonzero(sides_px == side_px))
-        return image.astype(np.float32)
+        return sides_px
 
     def _extended(self, lights: tuple[ExtendedLight, ...], plane: int) -> FloatArray:
         """The light of discs and stray light alone (height, width); the same lights again are

@@ -3,6 +3,7 @@
 This room is the only user of moderngl.
 """
 
+import math
 import zlib
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
@@ -18,6 +19,7 @@ from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import (
     NO_FRAME,
     Backend,
+    Path,
     ScreenView,
     SpriteSide,
     SpriteSides,
@@ -28,9 +30,11 @@ from hilstar.display.render.context import (
     MAX_WRITTEN_BYTES,
     Context,
     check_limits,
-    computes_in_software,
     create_context,
+    draws_by_cpu,
+    shares_memory,
 )
+from hilstar.display.render.cpu_stars import CpuImage, CpuStars, least_side_px
 from hilstar.display.render.driver import Driver
 from hilstar.display.render.encoder import (
     CUT_WINGS,
@@ -38,17 +42,16 @@ from hilstar.display.render.encoder import (
     Encoder,
     Eraser,
     LevelTexture,
-    Planes,
     Shares,
     lit_sides,
     most_covered_px,
+    set_planes,
     set_sides,
     splat_program,
     sprites_array,
 )
-from hilstar.display.render.exact_pass import ExactPass
-from hilstar.display.render.host_image import HostImage
-from hilstar.display.render.star_passes import ApartPasses, LightUnits, StarPasses
+from hilstar.display.render.exact_pass import ExactPass, PixelSums
+from hilstar.display.render.light_units import LightUnits, Planes
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
 from hilstar.optics.sprites import FrameLight
@@ -67,8 +70,7 @@ class Renderer(Backend):
     """
 
     context: Context
-    # whether a linear image alone may be drawn in the process's memory, where this GL can
-    ON_HOST = True
+    MAY_USE_CPU = True  # else points draw, whatever HILSTAR_DRAW says
 
     def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
@@ -91,6 +93,7 @@ class Renderer(Backend):
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
+                self._uses_cpu = self.MAY_USE_CPU and draws_by_cpu(self._ctx)
                 key = "sprite_sigma_px" if target.response else "psf_sigma_px"
                 check_limits(
                     self._ctx,
@@ -122,10 +125,10 @@ class Renderer(Backend):
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
-        fits = 4 * width * height <= MAX_WRITTEN_BYTES
-        on_host = self.ON_HOST and target.response is None and fits and computes_in_software(ctx)
-        self._host = HostImage(ctx, target.resolution_px, self._shares) if on_host else None
-        self._on_host = False  # where the last draw is
+        self._cpu_image: CpuImage | None = None  # the linear image of stars alone
+        if self._uses_cpu and target.response is None:
+            self._cpu_image = CpuImage(target.resolution_px, target.psf)
+        self._is_cpu_image = False  # where the last draw is
 
     def _wider(self, sides: SpriteSides) -> SpriteSides:
         """The sides of sprites that have the light of all planes."""
@@ -143,7 +146,8 @@ class Renderer(Backend):
         self._encoder: Encoder | None = None
         self._exact_passes: list[ExactPass] = []  # by plane, as those are chosen in turn
         self._units: LightUnits | None = None
-        self._passes: StarPasses | None = None
+        self._cpu_stars: CpuStars | None = None
+        self._pixel_sums: PixelSums | None = None  # those of `_cpu_stars`, for `exact`
         self._unit_splat: moderngl.Program | None = None  # where points are in units
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the
         # image.
@@ -183,34 +187,42 @@ class Renderer(Backend):
             set_sides(self._encoder.sprite_program, self._lit_sides)
             if lit_e_per_s and not target.sides:
                 self._cut_sides = self._wider(lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS))
-            # The passes count thresholds alone.
-            if not self._by_pixel.shader and LightUnits.takes(planes, target.resolution_px):
+            if not self._by_pixel.shader:  # light in units is compared with thresholds alone
                 self._build_units(self._levels, self._encoder)
-        for made in (self._encoder, *self._exact_passes, self._passes):
+        for made in (self._encoder, *self._exact_passes):
             self.tables += [] if made is None else made.tables
-        if by_star is not None and not self._exact_passes:
-            self.path = "NumPy"
-        elif self._passes is not None:
-            self.path = "compute shaders"
-        elif self._exact_passes:
-            self.path = "points, then compute shaders"
+        self.path = self._path_of_levels()
+
+    def _path_of_levels(self) -> Path:
+        if self._by_star is None:
+            return "points" if self._cpu_stars is None else "CPU"
+        if not self._exact_passes:
+            return "NumPy"
+        if self._cpu_stars is None:
+            return "points, then compute shaders"
+        return "CPU, then compute shaders"
 
     def _build_units(self, levels: LevelTexture, encoder: Encoder) -> None:
-        """Build what draws light in whole units: the passes of a software OpenGL, else sprites."""
+        """Build what draws light in whole units: on the CPU, else points.
+
+        `exact` takes the sums of both from memory that the GL shares; where it shares none, points.
+        """
         target, planes = self.target, self._planes
         units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
-        if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
-            made, psf = (
-                ApartPasses if planes.apart else StarPasses,
-                target.psf if self._by_star is not None else None,
-            )
-            self._passes = made(levels, planes, self._shares, units, psf)
+        if self._uses_cpu and not self._exact_passes:
+            self._cpu_stars = CpuStars(units, levels.image)
+            return
+        size = 4 * math.prod(target.resolution_px) * len(planes.panels)
+        if self._uses_cpu and shares_memory(self._ctx) and size <= MAX_WRITTEN_BYTES:
+            sums = self._pixel_sums = PixelSums(planes, levels)
+            side_px = least_side_px(target.psf)
+            self._cpu_stars = CpuStars(units, levels.image, sums.values, side_px)
             return
         self._unit_splat = splat_program(
             self._ctx, target.resolution_px, self._shares, planes, in_units=True
         )
-        planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)
-        planes.set(encoder.sprite_program)
+        set_planes(planes, self._unit_splat, most_e_per_s=units.most_e_per_s)
+        set_planes(planes, encoder.sprite_program)
         for program in (self._unit_splat, encoder.sprite_program):
             program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
 
@@ -234,49 +246,66 @@ class Renderer(Backend):
             if frame <= self._last_frame:
                 self.begin_anew()
             self._last_frame = frame
-            passes, by_star = self._passes, self._by_star
+            stars, by_star = self._cpu_stars, self._by_star
             if by_star is None or self._exact_passes:
                 sprites = as_maps(sprites, self.target)
             extended = sprites is not None and bool(sprites.extended)
-            # Stars are added to levels of extended light, by passes or by NumPy.
+            # Stars are added to levels of extended light, on the CPU or by NumPy.
             on_floor = extended and by_star is not None
-            units = (
-                None
-                if extended and (not on_floor or passes is None or self._planes.apart)
-                else self._units
-            )
+            in_units = not extended or (on_floor and stars is not None and not self._planes.apart)
+            units = self._units if in_units else None
             unit_e_per_s = None if units is None else units.unit_for(sprites)
             self._by_numpy = by_star is not None and (
                 not self._exact_passes or (on_floor and unit_e_per_s is None)
             )
             if sprites is not None and not self._by_numpy:
                 sprites = self._planes.packed(sprites)
-            if passes is not None and unit_e_per_s is not None:
+            # `exact` takes no finer units
+            if stars is not None and in_units and (unit_e_per_s or by_star is None):
                 floor = None
                 if sprites is not None and on_floor and by_star is not None:
                     with self._stage("extended"):
                         floor = self._floor(sprites, by_star.floor_turn(frame))
-                # Levels star by star; the linear image is drawn only when it is read.
-                self._undrawn, self._levels_black = (sprites, True), False
-                with self._stage("erase"):
-                    passes.lay(floor)
-                if sprites is not None and len(sprites):
-                    with self._stage("upload"):
-                        passes.upload(sprites)
-                    with self._stage("splat"):
-                        passes.add_light(unit_e_per_s)
-                    with self._stage("encode"):
-                        passes.encode()
-                self._choose(sprites, passes)
+                self._draw_on_cpu(stars, sprites, unit_e_per_s, floor)
                 return
-            if passes is not None:
-                passes.forget()
+            if stars is not None:
+                self._forget_cpu(stars)
             if self._by_numpy:
                 self._draw_by_numpy(sprites, frame)
                 self._undrawn = (sprites, False)
                 self._last_count = None
             else:
                 self._draw_by_points(sprites, unit_e_per_s)
+
+    def _draw_on_cpu(
+        self,
+        stars: CpuStars,
+        sprites: FrameLight | None,
+        unit_e_per_s: list[float] | None,
+        floor: LevelTexture | None,
+    ) -> None:
+        """Levels star by star; the linear image is drawn only when it is read."""
+        self._undrawn, self._levels_black = (sprites, True), False
+        with self._stage("erase"):
+            stars.lay(None if floor is None else floor.read())
+        if self._levels is not None:
+            self._levels.in_memory = True
+        if sprites is not None and len(sprites):
+            with self._stage("splat"):
+                stars.add(sprites, unit_e_per_s)
+            with self._stage("encode"):
+                stars.encode()
+        sums = self._pixel_sums
+        if sprites is not None and sums is not None:
+            with self._stage("upload"):
+                sums.upload(sprites, stars.unit_e_per_s, floor)
+        self._choose(sprites, sums)
+
+    def _forget_cpu(self, stars: CpuStars) -> None:
+        """Something else draws the levels, or has changed them."""
+        stars.forget()
+        if self._levels is not None:
+            self._levels.in_memory = False
 
     def draw_linear(self, sprites: FrameLight) -> None:
         """See `Backend.draw_linear`."""
@@ -322,7 +351,7 @@ class Renderer(Backend):
             encoder.sprite_program["reach_per_e"] = reach_per_e
             if in_units and unit_e_per_s is not None:
                 splat["reach_per_e"] = reach_per_e
-                self._planes.set(splat, unit_e_per_s=unit_e_per_s)
+                set_planes(self._planes, splat, unit_e_per_s=unit_e_per_s)
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
         sure = (
             None
@@ -349,7 +378,7 @@ class Renderer(Backend):
         """The context in which a stage of a frame runs; see StagedRenderer."""
         return UNTIMED
 
-    def _choose(self, sprites: FrameLight | None, passes: StarPasses | None) -> None:
+    def _choose(self, sprites: FrameLight | None, sums: PixelSums | None) -> None:
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last
         frame left.
         """
@@ -360,7 +389,7 @@ class Renderer(Backend):
                 one.left = None
                 continue
             with self._stage("choose"):
-                one.draw(self._buffer if passes is None else passes.sprites, sprites, passes)
+                one.draw(self._buffer if sums is None else sums.sprites, sprites, sums)
 
     def _draw_by_numpy(self, sprites: FrameLight | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
@@ -444,11 +473,11 @@ class Renderer(Backend):
     ) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn, sprites = None, as_maps(sprites, self.target)
-        self._on_host = (
-            self._host is not None and whole and not (sprites is not None and sprites.extended)
-        )
-        if self._host is not None and self._on_host:
-            self._host.draw(sprites)
+        extended = sprites is not None and bool(sprites.extended)
+        image = self._cpu_image
+        self._is_cpu_image = image is not None and whole and not extended
+        if image is not None and self._is_cpu_image:
+            image.draw(sprites)
             return
         with self._stage("erase"):
             self._erase(levels)
@@ -505,6 +534,8 @@ class Renderer(Backend):
             return self._exact_levels
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
+        if self._levels.in_memory:  # nothing of them is left to draw
+            return self._levels.read()
         with self._ctx:
             self._driver.wait()
             return self._levels.read()
@@ -521,8 +552,8 @@ class Renderer(Backend):
 
     def linear(self) -> Float32Array:
         """See `Backend.linear`."""
-        if self._host is not None and self._on_host:
-            return self._host.image
+        if self._cpu_image is not None and self._is_cpu_image:
+            return self._cpu_image.image
         if self._planes.apart:
             return self._white.linear()
         with self._ctx:
@@ -579,8 +610,8 @@ class Renderer(Backend):
         self._last_count, self._levels_black = None, False
         self._floor_encoder, self._floor_levels = None, None
         with self._ctx:
-            if self._passes is not None:
-                self._passes.forget()
+            if self._cpu_stars is not None:
+                self._forget_cpu(self._cpu_stars)
             self._extended.forget()
         self.begin_anew()
 

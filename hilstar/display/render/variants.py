@@ -39,7 +39,7 @@ class SplatVariant:
 class VariantRenderer(Renderer):
     """A renderer of linear images whose splat is a variant's. Free it with `close`."""
 
-    ON_HOST = False  # it is the splat that is compared
+    MAY_USE_CPU = False  # it is the splat that is compared
 
     def __init__(self, target: Target, variant: SplatVariant) -> None:
         super().__init__(target)

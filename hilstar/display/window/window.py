@@ -16,7 +16,6 @@ import numpy as np
 
 from hilstar.basics.errors import MachineError, NotThereError, did_you_mean
 from hilstar.basics.process.closing import Closing
-from hilstar.basics.process.scheduling import drawing_threads_apart
 from hilstar.basics.units import GL_VERSIONS, NS_PER_S
 from hilstar.display.window.awake import Awake
 from hilstar.display.window.library import glfw
@@ -215,8 +214,7 @@ class Window(Closing):
         width, height = (
             settings.resolution_px if self.display is None else self.display.resolution_px
         )
-        with drawing_threads_apart():
-            self._window = _newest_window(width, height, monitor)
+        self._window = _newest_window(width, height, monitor)
         if not self._window:
             raise MachineError(
                 "no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1"

@@ -355,7 +355,7 @@ def test_doctor_says_what_numpy_draws_where_opengl_is_missing(no_opengl):
     assert not check["ok"]
     assert (
         "apt-get install libegl1" in check["detail"]
-        and "NumPy draws frame, simulate and verify" in check["detail"]
+        and "the processor draws frame, simulate and verify" in check["detail"]
     )
 
 

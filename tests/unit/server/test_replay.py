@@ -190,8 +190,8 @@ def test_a_ledger_says_who_drew_it_and_a_log_does_not(ledger, log, config):
 
 
 def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():
-    here = DrawnBy("llvmpipe", "4.5", "compute shaders")
-    assert here.other_codes(DrawnBy("llvmpipe", "4.5", "compute shaders"), "exact") == 0
+    here = DrawnBy("llvmpipe", "4.5", "CPU, then compute shaders")
+    assert here.other_codes(DrawnBy("llvmpipe", "4.5", "CPU, then compute shaders"), "exact") == 0
     for other in (
         replace(here, gl_renderer="zink"),
         replace(here, gl_version="4.6"),

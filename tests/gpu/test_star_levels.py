@@ -1,5 +1,5 @@
-"""Frames drawn star by star: the levels of the light within the stars' reach, in whatever order
-and after whatever frame.
+"""Frames drawn in whole units of light: the levels of the light within the stars' reach, in
+whatever order and after whatever frame.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import pytest
 
 from hilstar.display.quantise import round_levels
 from hilstar.display.render.backend import SpriteSide, Target
+from hilstar.display.render.light_units import MAX_UNIT, WINGS
 from hilstar.display.render.renderer import Renderer
-from hilstar.display.render.star_passes import MAX_UNIT, WINGS
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf, pixel_shares
@@ -25,7 +25,7 @@ PANELS = {
     "srgb10": srgb_response(10),
     "gamma8": gamma_response(8),
 }
-# Light is summed in float32 by blending, in whole units here: both round by that of what they sum,
+# Light is summed in float32 by the linear image, in whole units here: both round by that of what they sum,
 # at most.
 FLOAT32 = 1e-6
 CUT = 1e-4  # of a star: what lies past a sprite two pixels smaller
@@ -88,20 +88,27 @@ def test_no_sum_is_too_large_for_its_pixel(count):
         assert np.count_nonzero(found) <= gl.footprint_px**2
 
 
-def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
+def test_where_units_are_too_coarse_the_light_is_as_fine(rng):
     """A panel of 16 bits, and on 8 bits so many stars of white that a unit would be much of a
-    step: the same as by points.
+    step: points are blended as they are, and on the CPU sums are of finer units.
     """
     bright = stars(20_000, rng, decades=(6, 7))
     for response, sprites in (
-        (srgb_response(16), stars(300, rng)),
+        (srgb_response(16), stars(300, rng, decades=(5, 7))),
         (gamma_response(8, 3.0), bright),
     ):
         target = Target(SIZE, GaussianPsf(SIGMA), response, WHITE)
         with Renderer(target) as gl:
-            assert gl._units is None or gl._units.unit_for(sprites) is None
+            assert gl._units.unit_for(sprites) is None
             gl.draw(sprites)
-            assert np.array_equal(gl.levels(), round_levels(gl.linear(), target.panel()))
+            found, light = gl.levels().copy(), gl.linear()
+            wanted = round_levels(light, target.panel())
+            if gl.path == "points":
+                assert np.array_equal(found, wanted)
+                continue
+            # wings and float32 aside; of 16 bits a level is finer than both
+            assert np.abs(found.astype(int) - wanted).max() <= 1
+            assert np.count_nonzero(found != wanted) <= 0.01 * np.count_nonzero(wanted)
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
@@ -196,14 +203,9 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
     ).all()
 
 
-@pytest.mark.parametrize("sigma", [(24.0, 24.0), (25.0, 25.0)])
-def test_the_largest_sprites_are_whole(sigma):
-    """A shader's loops may end early without a word: the largest sprites drawn star by star, and
-    the smallest that are not.
-    """
-    target = Target((400, 300), GaussianPsf(sigma), PANELS["srgb8"], WHITE)
+def test_the_largest_sprites_are_whole():
+    target = Target((400, 300), GaussianPsf((25.0, 25.0)), PANELS["srgb8"], WHITE)
     with Renderer(target) as gl:
-        assert (gl._units is not None) == (sigma[0] < 24.5)
         gl.draw(sprites_at(np.array([[200.2, 150.3]]), np.array([1e9]), gl.footprint_px))
         found, light, panel = gl.levels().copy(), gl.linear(), gl.target.panel()
     assert np.count_nonzero(found != round_levels(light, panel)) <= 3

@@ -15,7 +15,6 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.units import magnitude
 from hilstar.display.quantise import Panel
 from hilstar.display.response import Levels
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
 
@@ -139,9 +138,11 @@ class FootprintMap:
         row, column = (
             table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column)
         )
-        if isinstance(self._psf, GlassPsf) and sprites.spectra is not None:
+        if self._psf.by_colour and sprites.spectra is not None:
             x_px, y_px = data["pixel"].T + fraction
-            stamps = self._psf.of_stars(x_px, y_px, sprites.spectra, data["electrons_per_s"])
+            stamps = self._psf.stamps_at(x_px, y_px, sprites.spectra, data["electrons_per_s"])
+            if stamps.shape[1] != order.size:
+                raise InputError(f"a PSF that varies has a footprint of {order.size} px, not odd")
             stamps = np.ascontiguousarray(np.moveaxis(stamps, 0, 2))
         else:
             stamps = self._psf.stamps(fraction, data["electrons_per_s"], order.size)

@@ -10,6 +10,7 @@ is an image on a fine grid: its shares are tabulated by offset and interpolated.
 import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from itertools import count, zip_longest
@@ -83,6 +84,9 @@ TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
 # thirds of 4.2 tracker pixels before a PSF of 0.55 it is softer by 24 %, which a fit of the PSF to
 # dots takes for the PSF's own. What is sharper than SHARPEST_PX is summed up by pixels anyway.
 FINE_SIGMAS, MIN_PARTS, MAX_PARTS, SHARPEST_PX = 0.7, 3, 16, 0.2
+ONE_PSF = "one PSF for all stars"  # by this name it may be chosen
+# A PSF that is the same for all light gives all of it to one wavelength, whichever.
+ALL_LIGHT, ONE_WAVELENGTH_NM = np.ones(1), np.array([550.0])
 
 
 class ShareShader(NamedTuple):
@@ -110,11 +114,17 @@ class Psf(ABC):
     """How the light of a point spreads over pixels. Offsets are pixel centre minus star, px, x
     right and y down.
 
-    `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum.
+    `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum. One
+    that does has an odd footprint and overrides `stamps_at`, `image` and `centroids_px`: those who
+    draw ask these.
+    A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths, or (n, L) of n
+    stars; `mean_shares` (L,) are those of light without a spectrum of its own.
     """
 
     by_place = False
     by_colour = False
+    mean_shares: FloatArray = ALL_LIGHT
+    wavelengths_nm: FloatArray = ONE_WAVELENGTH_NM
     # whether a share is the product of one along x and one along y, as exact.comp takes it
     separable = False
 
@@ -173,6 +183,56 @@ class Psf(ABC):
         region: tuple[int, int, int, int],
     ) -> Float32Array:
         """The light of n points in all pixels of a region: left, top, width, height."""
+
+    def stamps_at(
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        spectra: FloatArray,
+        electrons_per_s: FloatArray | Float32Array | None = None,
+    ) -> Float32Array:
+        """The light of stars at places (n,) in squares (n, side, side) about the pixels nearest to
+        them: of 1 electron per second each without `electrons_per_s` (n,).
+
+        The side is odd: the footprint's, or one more.
+        """
+        rates = np.ones(len(x_px)) if electrons_per_s is None else electrons_per_s
+        fraction_px = np.stack([place - np.floor(place + 0.5) for place in (x_px, y_px)])
+        return np.moveaxis(self.stamps(fraction_px, rates, self.footprint_px | 1), 2, 0)
+
+    def image(
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        spectra: FloatArray,
+        electrons_per_s: FloatArray | Float32Array,
+        resolution_px: tuple[int, int],
+    ) -> Float32Array:
+        """The light of stars at places (n,) in all pixels (height, width), electrons per second."""
+        rates = np.asarray(electrons_per_s, dtype=np.float64)
+        return self.spread(x_px, y_px, rates, (0, 0, *resolution_px))
+
+    def centroids_px(
+        self, x_px: FloatArray, y_px: FloatArray, spectra: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The centroids (n,) of the light of stars at places (n,), px, and their illumination
+        relative to the axis.
+        """
+        return x_px, y_px, np.ones(len(x_px))
+
+    @property
+    def in_the_middle(self) -> "Psf":
+        """The one PSF of all stars that comes nearest: of the field's middle and mean light."""
+        return self
+
+    def simpler(self) -> Iterator[tuple[str, Callable[[], "Psf"]]]:
+        """What makes PSFs that take less to draw, by name, the least first."""
+        yield from ()
+
+    @property
+    def components(self) -> int:
+        """How many images a star's PSF is the sum of."""
+        return 1
 
     @abstractmethod
     def cut_share(self, size_px: int) -> float:

@@ -193,7 +193,7 @@ def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(
                 blackbody_exitance_w_m2_m(fine_nm, np.array([temperature_k])[:, None])[0] * fine_nm
             )
             light /= light.sum()
-            found = psf.of_stars(
+            found = psf.stamps_at(
                 *place[:, None], light @ NodeSpline(np.array(nodes_nm))(fine_nm), np.ones(1)
             )[0]
             wanted = 0.0

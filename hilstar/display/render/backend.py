@@ -23,7 +23,6 @@ from hilstar.display.quantisers import QUANTISERS, Quantisation
 from hilstar.display.response import Levels, Response
 from hilstar.optics.extended import LightMap
 from hilstar.optics.frame_motion import Orientation
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight, by_channel, by_primary, without_stars
 from hilstar.sky.stars import Stars
@@ -311,7 +310,7 @@ def as_maps(sprites: FrameLight | None, target: Target) -> FrameLight | None:
     all others as they are.
     """
     psf = target.psf
-    if sprites is None or sprites.spectra is None or not isinstance(psf, GlassPsf):
+    if sprites is None or sprites.spectra is None or not psf.by_colour:
         return sprites
     if sprites.primaries is not None:
         parts = (
@@ -320,7 +319,10 @@ def as_maps(sprites: FrameLight | None, target: Target) -> FrameLight | None:
         )
         lights = tuple(() if part is None else part.extended for part in parts)
         return replace(without_stars(sprites), extended=lights[0], lights=lights)
-    image = np.ascontiguousarray(psf.image(sprites, sprites.spectra, target.resolution_px))
+    rates = sprites.data["electrons_per_s"]
+    at_px = sprites.x_px, sprites.y_px
+    light = psf.image(*at_px, sprites.spectra, rates, target.resolution_px)
+    image = np.ascontiguousarray(light)
     return replace(
         without_stars(sprites), extended=(*sprites.extended, LightMap(image, lasting=False))
     )

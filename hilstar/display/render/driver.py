@@ -56,6 +56,8 @@ class Driver:
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
+        # Private, for moderngl has no public way to its loader (looked at in 5.13.0): a loader
+        # of our own would have to know GLX, EGL and WGL, and which of them made this context.
         load: Callable[[str], int] = ctx.mglo._context.load_opengl_function
         # PYFUNCTYPE keeps Python's lock, for calls that only queue work or ask; CFUNCTYPE frees it.
         self._fence = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint)(

@@ -26,9 +26,8 @@ from hilstar.instruments.simulate.noise import attitude_limits_arcsec, field_sta
 from hilstar.instruments.simulate.star_finder import star_finder
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.camera import Camera
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import StarGlass, bench_stars
+from hilstar.server.bench.build import bench_stars, star_glass
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.tracker.centroiders import star_places
 
@@ -208,11 +207,11 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
     """
     tracker, fields = file.config.tracker, []
     psf, camera = tracker_psf(tracker, file.folder), tracker_camera(tracker, file.folder)
-    if not isinstance(psf, GlassPsf):
+    glass = star_glass(file, psf)
+    if glass is None:
         return None
-    stars, glass, kind = (
+    stars, kind = (
         bench_stars(file.config, file.folder),
-        StarGlass(file, psf),
         file.config.verify.judge or "window",
     )
     reach = math.ceil(4 * max(1.0, *psf.width_px))

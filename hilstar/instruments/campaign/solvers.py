@@ -33,9 +33,8 @@ from hilstar.instruments.simulate.live_exposure import LiveTracker
 from hilstar.instruments.simulate.pictures import write_dn_picture
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.instruments.simulate.star_finder import crowded, nearest
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import GaussianPsf, Psf
-from hilstar.server.bench.build import StarGlass
+from hilstar.server.bench.build import StarGlass, star_glass
 from hilstar.server.bench.cameras import flight_camera, tracker_psf
 from hilstar.server.bench.config import GAUSSIAN
 from hilstar.server.bench.config.hardware import TrackerOptics
@@ -215,11 +214,8 @@ class CentroidSolver:
             told = tracker_psf(
                 msgspec.structs.replace(tracker.config.tracker, optics=optics), tracker.file.folder
             )
-            glass = (
-                StarGlass(tracker.file, told)
-                if isinstance(told, GlassPsf) and isinstance(tracker, Simulator)
-                else None
-            )
+            simulated = isinstance(tracker, Simulator)
+            glass = star_glass(tracker.file, told) if simulated else None
             self._told = tracker.file.sha256, told, glass
         return self._told[1:]
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
 from hilstar.tracker.centroiders import Pixels, ToldPsf
 
@@ -25,7 +24,7 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
     near = np.arange(side_px) - side_px // 2
 
     def of(x: FloatArray, y: FloatArray) -> FloatArray:
-        if not isinstance(psf, GlassPsf):
+        if not psf.by_colour:
             offsets = near - x[:, None], near - y[:, None]
             return np.stack(
                 [
@@ -33,10 +32,9 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
                     for across, down in zip(*offsets, strict=True)
                 ]
             )
-        places, own = (columns + x, rows + y), psf.footprint_px
-        light = psf.of_stars(
-            *places, psf.mean_shares if shares is None else shares, np.ones(len(x))
-        )
+        places = columns + x, rows + y
+        light = psf.stamps_at(*places, psf.mean_shares if shares is None else shares)
+        own = light.shape[1]
         light = np.pad(light, ((0, 0), (1, 1), (1, 1)))
         # The glass's square is about the pixel nearest to the star, this one about its own.
         to = [

@@ -20,7 +20,7 @@ from hilstar.display.quantise import LitLight, Panel
 from hilstar.display.render.backend import Target
 from hilstar.display.render.numpy_backend import headless_context, open_backend
 from hilstar.optics.camera import Camera
-from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
+from hilstar.optics.glass.glass_psf import NodeSpline
 from hilstar.optics.psf import Psf, square_points
 from hilstar.optics.sprites import mean_share, pack_sprites
 from hilstar.server.bench.build import bench_primaries, named_channels
@@ -100,9 +100,7 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     if colours is None:
         return ALL_ALIKE
     spectra = (
-        colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
-        if isinstance(psf, GlassPsf)
-        else None
+        colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm) if psf.by_colour else None
     )
     places = [(float(x), float(y)) for x, y in colours.places_px]
     return tuple(
@@ -197,7 +195,7 @@ class TwinOptics(Closing):
         for begin in range(at_once, len(lit.place), at_once):
             total += self._points(lit.part(begin, begin + at_once), primary)
         # a measured PSF may be negative somewhere
-        return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total
+        return np.maximum(total, 0.0) if self._psf.by_colour else total
 
     def _near_the_detector(self, lit: LitLight, primary: Primary) -> LitLight:
         """The lit pixels that may light the detector, of a screen that it may see a small part
@@ -221,9 +219,10 @@ class TwinOptics(Closing):
         light = np.repeat(lit.e_per_s / len(dx), len(dx))
         star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
         sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
-        if isinstance(self._psf, GlassPsf):  # grey light has no spectrum here
+        if self._psf.by_colour:  # grey light has no spectrum here
             shares = self._psf.mean_shares if primary.shares is None else primary.shares
-            return self._psf.image(sprites, shares, size_px).astype(np.float64)
+            at_px, rates = (sprites.x_px, sprites.y_px), sprites.data["electrons_per_s"]
+            return self._psf.image(*at_px, shares, rates, size_px).astype(np.float64)
         self._renderer.draw(sprites)
         return self._renderer.linear().astype(np.float64)
 

@@ -25,7 +25,6 @@ from hilstar.instruments.simulate.shutter import rolled
 from hilstar.optics.camera import Camera, linear_shares
 from hilstar.optics.exposure_motion import MIDDLE_S, own_row_s
 from hilstar.optics.frame_motion import EVERY, Scan
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.layers.bodies import disc_stars
 from hilstar.optics.layers.fault_kinds import CosmicRays, Now
 from hilstar.optics.layers.fault_light import FaultView
@@ -50,6 +49,7 @@ from hilstar.server.bench.build import (
     bench_sources,
     bench_stars,
     moved,
+    star_glass,
 )
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.config import BenchConfig
@@ -165,14 +165,11 @@ class Simulator(Closing):
         self.camera = tracker_camera(tracker, self.file.folder)
         self.canvas = detector_canvas(self.file, self.camera, self._psf)
         psf = self.canvas.psf
-        self.glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
+        self.glass = star_glass(self.file, psf)
         self._glasses = [self.glass]
         if (bayer := tracker.detector.bayer) is not None:
             channels = bench_channels(tracker, self.file.folder)
-            self._glasses = [
-                StarGlass(self.file, psf, one) if isinstance(psf, GlassPsf) else None
-                for one in channels
-            ]
+            self._glasses = [star_glass(self.file, psf, optics) for optics in channels]
         elif len(tracker.quantum_efficiencies) > 1:
             say_once(NO_MOSAIC, "[tracker]")
         self._bayer = bayer
@@ -303,7 +300,11 @@ class Simulator(Closing):
             self.renderer.draw(sprites)
             return self.renderer.linear()
         image = glass.psf.image(
-            sprites, glass.shares(stars, sprites.star), self.config.tracker.resolution_px
+            sprites.x_px,
+            sprites.y_px,
+            glass.shares(stars, sprites.star),
+            sprites.data["electrons_per_s"],
+            self.config.tracker.resolution_px,
         )
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))

@@ -35,8 +35,8 @@ from hilstar.instruments.study.settings import (
     lone_windows,
 )
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, in_turn
-from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
-from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.glass.glass_psf import NodeSpline
+from hilstar.optics.psf import GaussianPsf, Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.build import (
     StarGlass,
@@ -353,7 +353,7 @@ def study_lateral(folder: Path) -> Iterator[Row]:
         planar, optics=TrackerOptics(psf=str(resource_path("configs", "planar-1897.fits")))
     )
     psf, (width, height) = tracker_psf(tracker, folder), tracker.resolution_px
-    if not isinstance(psf, GlassPsf):
+    if not psf.by_colour:
         raise AssertionError("the file has a glass")
     for panel in PANELS:
         file = file_of(folder, panel, MONO_SENSOR, FAINTEST_V_MAG)
@@ -387,7 +387,7 @@ def study_lateral(folder: Path) -> Iterator[Row]:
                 yield lens, panel, colour, sky_px, off_px, off_px / sky_px
 
 
-def moved_px(psf: GlassPsf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
+def moved_px(psf: Psf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
     """By how much spectra (n, L) move stars at places (2, n), px, against one of them there."""
     found = [
         psf.centroids_px(places_px[0], places_px[1], one)[:2] for one in (spectra, spectra[against])

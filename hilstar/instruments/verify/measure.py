@@ -35,7 +35,6 @@ from hilstar.instruments.simulate.star_finder import (
 )
 from hilstar.instruments.simulate.twin import Twin, TwinField, true_calibration
 from hilstar.optics.camera import Camera
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.moving import wide_bodies
@@ -308,7 +307,7 @@ def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
     """The effect of a glass on stars where they are; None for a PSF that is the same everywhere,
     and without a star.
     """
-    if not isinstance(psf, GlassPsf) or not stars:
+    if not psf.by_colour or not stars:
         return None
     x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
     to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)

@@ -9,9 +9,9 @@ quadratic functions of the place: stars whose places are alike are one product o
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -25,11 +25,11 @@ from hilstar.optics.psf import (
     MAX_FOOTPRINT_PX,
     MAX_UNEVEN,
     MIN_WIDTH_PX,
+    ONE_PSF,
     PIXEL_VARIANCE,
     SPLINE_DEGREE,
     SampledPsf,
 )
-from hilstar.optics.sprites import FrameLight
 
 # share of any PSF's light that a footprint leaves out: at 10 px it moves a centroid by up to 3e-4
 # px
@@ -49,6 +49,8 @@ ON_EDGE_PX = 1e-6
 SMALLEST, DARK = 1e-15, 1e-12  # numbers, and illuminations, that count as none
 SPRITES_AT_ONCE_PX = 2_000_000
 MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
+# basis images of the simpler glasses that may stand for one
+COMPONENTS = (3, 6, 12)
 
 
 Kernel = Literal["linear", "thin_plate_spline", "quintic"]
@@ -352,8 +354,8 @@ class GlassPsf(SampledPsf):
         )
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
-        """How much stars at places (n,) have of each basis image (n, K); `shares` as in
-        `of_stars`.
+        """How much stars at places (n,) have of each basis image (n, K); `shares` as
+        spectra of `Psf`.
         """
         by_field, shares = (
             self.field(x_px, y_px).T.astype(np.float32),
@@ -402,45 +404,42 @@ class GlassPsf(SampledPsf):
         return np.asarray(self.optics.weights @ firsts / self.per_px)
 
     def centroids_px(
-        self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
+        self, x_px: FloatArray, y_px: FloatArray, spectra: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The centroids (n,) of the light of stars at places (n,), px, and their illumination
         relative to the axis.
 
-        What lies outside the images does not count. `shares` as in `of_stars`.
+        What lies outside the images does not count.
         """
         optics, by_field = self.optics, self.field(x_px, y_px)
         falls = optics.illumination * optics.inside
-        total = ((by_field @ falls) * shares).sum(axis=1)
+        total = ((by_field @ falls) * spectra).sum(axis=1)
         lit = total > DARK
         off = [
-            ((by_field @ (falls * off)) * shares).sum(axis=1)
+            ((by_field @ (falls * off)) * spectra).sum(axis=1)
             for off in np.moveaxis(self.moved_px, 2, 0)
         ]
         x, y = (
             place + np.where(lit, first / np.where(lit, total, 1), 0)
             for place, first in zip((x_px, y_px), off, strict=True)
         )
-        return x, y, ((by_field @ optics.illumination) * shares).sum(axis=1)
+        return x, y, ((by_field @ optics.illumination) * spectra).sum(axis=1)
 
-    def of_stars(
+    def stamps_at(
         self,
         x_px: FloatArray,
         y_px: FloatArray,
-        shares: FloatArray,
-        electrons_per_s: FloatArray | Float32Array,
+        spectra: FloatArray,
+        electrons_per_s: FloatArray | Float32Array | None = None,
     ) -> Float32Array:
-        """The light of stars at places (n,) in squares of pixels (n, side, side) about the pixels
-        nearest to them.
-
-        Their light has `shares` (n, L) at each wavelength, or (L,) all of it.
-        """
+        """See `Psf.stamps_at`: each by its place and spectrum."""
+        rates = np.ones(len(x_px)) if electrons_per_s is None else electrons_per_s
         order = np.argsort(_square(x_px, y_px, self._squares)[0])
         stamps, scale = self._drawn(
-            x_px[order], y_px[order], shares[order] if shares.ndim == 2 else shares
+            x_px[order], y_px[order], spectra[order] if spectra.ndim == 2 else spectra
         )
         squares = np.empty_like(stamps)
-        squares[order] = stamps * (electrons_per_s[order] * scale)[:, None]
+        squares[order] = stamps * (rates[order] * scale)[:, None]
         return squares.reshape(-1, self.footprint_px, self.footprint_px)
 
     def _drawn(
@@ -481,11 +480,14 @@ class GlassPsf(SampledPsf):
         return found
 
     def image(
-        self, sprites: FrameLight, shares: FloatArray, resolution_px: tuple[int, int]
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        spectra: FloatArray,
+        electrons_per_s: FloatArray | Float32Array,
+        resolution_px: tuple[int, int],
     ) -> Float32Array:
-        """The light of sprites (n,) in all pixels (height, width), electrons per second;
-        `shares` as in `of_stars`.
-        """
+        """See `Psf.image`: each by its place and spectrum."""
         # as `NodeSpline`; its product takes half the time of `np.add.at`
         from scipy.sparse import csc_array
 
@@ -497,24 +499,44 @@ class GlassPsf(SampledPsf):
             max(1, SPRITES_AT_ONCE_PX // side**2),
         )
         order, room = (
-            np.argsort(_square(sprites.x_px, sprites.y_px, self._squares)[0]),
+            np.argsort(_square(x_px, y_px, self._squares)[0]),
             np.empty(0, np.float32),
         )
         for begin in range(0, max(len(order), 1), at_once):
             part = order[begin : begin + at_once]
-            x_px, y_px = sprites.x_px[part], sprites.y_px[part]
-            stamps, scale = self._drawn(x_px, y_px, shares[part] if shares.ndim == 2 else shares)
+            at_px = x_px[part], y_px[part]
+            stamps, scale = self._drawn(*at_px, spectra[part] if spectra.ndim == 2 else spectra)
             columns, rows = (
-                np.floor(place + 0.5).astype(np.int32) + side - side // 2 for place in (x_px, y_px)
+                np.floor(place + 0.5).astype(np.int32) + side - side // 2 for place in at_px
             )
             places, ends = (
                 (rows * across + columns)[:, None] + near,
                 np.arange(len(part) + 1, dtype=np.int32) * side**2,
             )
             sparse = csc_array((stamps.ravel(), places.ravel(), ends), (size, len(part)))
-            light = np.asarray(sparse @ (sprites.data["electrons_per_s"][part] * scale))
+            light = np.asarray(sparse @ (electrons_per_s[part] * scale))
             room = room + light if begin else light
         return room.reshape(-1, across)[side:-side, side:-side]
+
+    @property
+    def in_the_middle(self) -> SampledPsf:
+        """See `Psf.in_the_middle`: the mean PSF."""
+        return SampledPsf(self.samples, self.per_px, self.pixel_integrated)
+
+    def simpler(self) -> Iterator[tuple[str, Callable[[], SampledPsf]]]:
+        """See `Psf.simpler`: one PSF, Gaussians over the field, few basis images."""
+        yield ONE_PSF, lambda: self.in_the_middle
+        if self.optics.weights.shape[:2] == (1, 1):
+            return
+        yield "Gaussians by field", partial(as_gaussians, self)
+        for count in COMPONENTS:
+            if count < self.components:
+                yield f"a basis of {count}", partial(with_components, self, count)
+
+    @property
+    def components(self) -> int:
+        """See `Psf.components`: the basis images."""
+        return len(self.optics.basis)
 
     def blurred(self, sigma_px: float) -> "GlassPsf":
         """The basis convolved with a round Gaussian, with room for what spreads beyond it."""

@@ -29,7 +29,7 @@ from hilstar.display.render.backend import Target, level_cost
 from hilstar.display.render.numpy_backend import headless_context, open_backend
 from hilstar.optics.camera import Camera
 from hilstar.optics.frame_motion import Orientation, Scan
-from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
+from hilstar.optics.glass.glass_psf import NodeSpline
 from hilstar.optics.layers.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.optics.layers.truth import StarInView, brightest_in_view
 from hilstar.optics.layers.view import Canvas, View
@@ -302,6 +302,7 @@ def _assembled(
             )
         faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
         shown, faint = split_by_rate(stars, faintest, drive)
+        glass = star_glass(file, psf)
         return Bench(
             file=file,
             config=config,
@@ -318,7 +319,7 @@ def _assembled(
             faint_stars=faint,
             sources=sources,
             tracker_psf=before_detector(config, file.folder, camera),
-            spectra=StarGlass(file, psf).shares if isinstance(psf, GlassPsf) else None,
+            spectra=None if glass is None else glass.shares,
             drawn=drawn,
             renderer=open_backend(target, context),
             colours=colours,
@@ -766,7 +767,7 @@ class StarGlass:
     """
 
     def __init__(
-        self, file: BenchFile, psf: GlassPsf, optics: Optics | None = None, band_nm: float = BAND_NM
+        self, file: BenchFile, psf: Psf, optics: Optics | None = None, band_nm: float = BAND_NM
     ) -> None:
         self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
         self._catalog: Catalog | None = None
@@ -856,3 +857,8 @@ class StarGlass:
             [band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1
         )
         return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))
+
+
+def star_glass(file: BenchFile, psf: Psf, optics: Optics | None = None) -> StarGlass | None:
+    """The spectra of a bench's stars as `psf` has them; None for one that is the same for all."""
+    return StarGlass(file, psf, optics) if psf.by_colour else None

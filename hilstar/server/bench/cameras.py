@@ -19,7 +19,7 @@ from hilstar.basics.errors import InputError
 from hilstar.display.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.optics.camera import Camera, bounded
 from hilstar.optics.glass.glass_psf import regridded
-from hilstar.optics.psf import GaussianPsf, Psf, SampledPsf, read_psf
+from hilstar.optics.psf import ONE_PSF, GaussianPsf, Psf, SampledPsf, read_psf
 from hilstar.server.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, Tracker
 from hilstar.server.bench.glass import (
     Onto,
@@ -30,7 +30,6 @@ from hilstar.server.bench.glass import (
     through_glass,
 )
 from hilstar.server.bench.least_psf import (
-    ONE_PSF,
     WHOLE,
     Choice,
     first_within,

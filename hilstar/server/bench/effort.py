@@ -19,7 +19,6 @@ from hilstar.display.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantise
 from hilstar.display.quantisers import BY_COST, QUANTISERS, Quantisation
 from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
 from hilstar.display.response import Response
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import MAX_CUT, Psf
 from hilstar.server.bench.code_errors import CodeErrors, CodeStars, code_stars, worst_errors
 from hilstar.server.bench.config import RenderSettings
@@ -512,7 +511,7 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
 def psf_part(light: Light, choice: Choice) -> Choice:
     """The choice of the PSF, with what a glass takes."""
     glass_ms = GLASS_MS_A_STAR * light.stars
-    if isinstance(light.psf, GlassPsf):
+    if light.psf.by_colour:
         return replace(choice, ms=glass_ms)
     return replace(choice, saved_ms=glass_ms)
 

@@ -27,7 +27,6 @@ from hilstar.display.response import Codes, Levels, code_dtype
 from hilstar.optics.camera import Camera
 from hilstar.optics.extended import LightMap
 from hilstar.optics.frame_motion import Scan
-from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.layers.bodies import BodyLayer, disc_stars
 from hilstar.optics.layers.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.optics.layers.truth import (
@@ -469,7 +468,7 @@ class Bench:
         """Places of the sprites that are over white: of light as a whole, or of any primary."""
         psf, spectra = self.psf, sprites.spectra
         # as bright as the mean PSF's stars with the same peaks
-        if isinstance(psf, GlassPsf) and spectra is not None:
+        if psf.by_colour and spectra is not None:
             data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
             bright = np.flatnonzero(
                 data["electrons_per_s"] * (sprites.per_star * psf.peak_share) > half_white
@@ -479,7 +478,7 @@ class Bench:
                 sprites.y_px[bright],
                 data["electrons_per_s"][bright],
             )
-            stamps = psf.of_stars(
+            stamps = psf.stamps_at(
                 x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate
             )
             data["electrons_per_s"][bright] = stamps.max(axis=(1, 2)) / psf.shares(

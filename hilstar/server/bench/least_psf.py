@@ -8,24 +8,17 @@ star's light and centroid, in all of its pixels and in a Gaussian window as wide
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.optics.glass.glass_psf import GlassPsf, as_gaussians, with_components
-from hilstar.optics.psf import GaussianPsf, Psf, SampledPsf
+from hilstar.optics.psf import ONE_PSF, GaussianPsf, Psf, SampledPsf
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
 
 MAG_PER_SHARE = 2.5 / math.log(10)
 SPECTRA_K = (3000.0, 20_000.0)
-GAUSSIAN_PSF, ONE_PSF, WHOLE = (
-    "a Gaussian",
-    "one PSF for all stars",
-    "each star by its place and spectrum",
-)
-COMPONENTS = (3, 6, 12)
+GAUSSIAN_PSF, WHOLE = "a Gaussian", "each star by its place and spectrum"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,14 +62,9 @@ class PsfErrors:
 def candidates(psf: SampledPsf) -> Iterator[tuple[str, Callable[[], Psf]]]:
     """What makes a PSF in the place of one, by name, the least first, and itself at last."""
     yield GAUSSIAN_PSF, lambda: GaussianPsf(psf.width_px)
-    if isinstance(psf, GlassPsf):
-        yield ONE_PSF, lambda: SampledPsf(psf.samples, psf.per_px, psf.pixel_integrated)
-        if psf.optics.weights.shape[:2] != (1, 1):
-            yield "Gaussians by field", partial(as_gaussians, psf)
-            for count in COMPONENTS:
-                if count < len(psf.optics.basis):
-                    yield f"a basis of {count}", partial(with_components, psf, count)
-    yield WHOLE if isinstance(psf, GlassPsf) else ONE_PSF, lambda: psf
+    yield from psf.simpler()
+    name = WHOLE if psf.by_colour else ONE_PSF
+    yield name, lambda: psf
 
 
 def psf_choices(
@@ -148,9 +136,10 @@ def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
     """
     side, x, y = psf.footprint_px, *np.repeat(places_px, len(SPECTRA_K), axis=0).T
     fraction = np.stack([place - np.floor(place + 0.5) for place in (x, y)])
-    if isinstance(one, GlassPsf):
-        stamps = one.of_stars(x, y, np.tile(_spectra(one), (len(places_px), 1)), np.ones(len(x)))
-        cut, more = max(0, (one.footprint_px - side) // 2), max(0, (side - one.footprint_px) // 2)
+    if one.by_colour:
+        stamps = one.stamps_at(x, y, np.tile(_spectra(one), (len(places_px), 1)))
+        whole = stamps.shape[1]
+        cut, more = max(0, (whole - side) // 2), max(0, (side - whole) // 2)
         stamps = np.pad(
             stamps[:, cut : cut + side, cut : cut + side], ((0, 0), (more, more), (more, more))
         )
@@ -170,7 +159,7 @@ def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
     return np.array(found)
 
 
-def _spectra(psf: GlassPsf) -> FloatArray:
+def _spectra(psf: Psf) -> FloatArray:
     nm = psf.wavelengths_nm
     if len(nm) == 1:
         return np.ones((len(SPECTRA_K), 1))

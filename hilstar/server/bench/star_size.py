@@ -17,8 +17,7 @@ import numpy as np
 
 from hilstar.basics.units import magnitude
 from hilstar.optics.camera import Camera
-from hilstar.optics.glass.glass_psf import GlassPsf
-from hilstar.optics.psf import PIXEL_VARIANCE, GaussianPsf, Psf, SampledPsf, square_points
+from hilstar.optics.psf import PIXEL_VARIANCE, GaussianPsf, Psf, square_points
 from hilstar.server.bench.cameras import (
     before_detector,
     display_psf,
@@ -191,7 +190,7 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
     ratio = tracker.focal_length_px / display.focal_length_px
     sprite = display_psf(config, folder, display)
     lens, sky = (
-        _in_the_middle(psf)
+        psf.in_the_middle
         for psf in (before_detector(config, folder, display), tracker_psf(config.tracker, folder))
     )
     blur_px = config.collimator.psf_sigma_px
@@ -216,15 +215,6 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
         shared_px=shown.shared_px,
         sky_shared_px=of_sky.shared_px,
         would_do=_remedy(config, display, tracker, widths, limit) if sigma_ratio > limit else None,
-    )
-
-
-def _in_the_middle(psf: Psf) -> Psf:
-    """Of a glass, its mean PSF in the field's middle."""
-    return (
-        SampledPsf(psf.samples, psf.per_px, psf.pixel_integrated)
-        if isinstance(psf, GlassPsf)
-        else psf
     )
 
 

@@ -110,7 +110,7 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         GlassRow(
             scene.name,
             name,
-            len(psf.optics.basis) if isinstance(psf, GlassPsf) else 1,
+            psf.components,
             *errors[name],
             **asdict(times[name]),
             on_front=said(bool(on)),

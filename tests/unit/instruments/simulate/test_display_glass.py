@@ -75,7 +75,7 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
         exposure = simulator.expose(simulator.view(q, np.zeros(3)), None)
         table, glass = exposure.truth, simulator.glass
         shares = glass.shares_of(simulator.stars, table["hip"])
-        exact = glass.psf.of_stars(table["x_px"], table["y_px"], shares, np.ones(len(table)))
+        exact = glass.psf.stamps_at(table["x_px"], table["y_px"], shares, np.ones(len(table)))
     with (
         open_bench(file) as shown,
         TwinOptics(BenchGeometry(shown.camera, camera), shown.tracker_psf) as optics,

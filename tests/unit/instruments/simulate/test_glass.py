@@ -344,7 +344,7 @@ def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):
     assert cameras[2].principal_point_px[0] == cameras[0].principal_point_px[0] + 2.0
     x, y = np.array([60.0]), np.array([200.0])
     lit = [
-        psf.of_stars(at, y, psf.mean_shares, np.ones(1))
+        psf.stamps_at(at, y, psf.mean_shares, np.ones(1))
         for psf, at in zip(psfs, (x, x, x + 2), strict=True)
     ]
     assert lit[1] == pytest.approx(lit[0], abs=1e-7)

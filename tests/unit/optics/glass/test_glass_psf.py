@@ -12,7 +12,6 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.optics.glass.glass_psf import GlassPsf, glass_psf
 from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of
-from hilstar.optics.sprites import pack_sprites
 from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile, stack, truth
 
 # What is asked of the whole chain; measured here: 3e-7, 2e-4 px and 4e-3 at the points, 1.4e-3 px
@@ -23,7 +22,7 @@ MEAN = np.array([0.2, 0.3, 0.3, 0.2])
 
 def errors(psf: GlassPsf, x_px, y_px, shares, focus_um=0.0) -> np.ndarray:
     """Largest errors of flux, centroid (px) and second moments (relative) of stars."""
-    found = psf.of_stars(x_px, y_px, shares, np.ones(len(x_px)))
+    found = psf.stamps_at(x_px, y_px, shares, np.ones(len(x_px)))
     worst = np.zeros(3)
     for x, y, share, light in zip(x_px, y_px, shares, found, strict=True):
         own, wanted = moments(light), moments(truth(x, y, share, len(light), focus_um))
@@ -69,7 +68,7 @@ def test_scattered_points_are_interpolated_too(rng):
     points = np.column_stack([places, np.full(len(places), 550.0), np.zeros(len(places))])
     psf = glass_psf(glass_of(Stack(images, points, facts_of(len(places)), 4)), 0.0, np.ones(1))
     for x, y in rng.uniform(20, SIDE_PX - 20, (20, 2)):
-        light = psf.of_stars(np.array([x]), np.array([y]), np.ones(1), np.ones(1))[0]
+        light = psf.stamps_at(np.array([x]), np.array([y]), np.ones(1), np.ones(1))[0]
         wanted = moments(truth(x, y, [1.0], len(light), wavelengths_nm=(550.0,)))
         assert moments(light)[1:3] == pytest.approx(wanted[1:3], abs=CENTROID_PX)
         assert moments(light)[3:] == pytest.approx(wanted[3:], rel=SECOND)
@@ -90,8 +89,7 @@ def test_the_centroid_that_is_said_is_that_of_the_light_that_is_drawn(glass, rng
     """
     psf, size_px = glass_psf(glass, 0.0, MEAN), (SIDE_PX, SIDE_PX)
     x_px, y_px = np.array([100.3]), np.array([60.8])
-    sprites = pack_sprites(x_px, y_px, np.array([1e4]), np.zeros(1, int), size_px, psf.footprint_px)
-    image = psf.image(sprites, MEAN, size_px).astype(float)
+    image = psf.image(x_px, y_px, MEAN, np.array([1e4]), size_px).astype(float)
     x, y, light = psf.centroids_px(x_px, y_px, MEAN)
     assert image.sum(axis=0) @ np.arange(SIDE_PX) / image.sum() == pytest.approx(x[0], abs=2.3e-3)
     assert image.sum(axis=1) @ np.arange(SIDE_PX) / image.sum() == pytest.approx(y[0], abs=2.3e-3)
@@ -101,8 +99,8 @@ def test_the_centroid_that_is_said_is_that_of_the_light_that_is_drawn(glass, rng
 
 def test_beyond_the_field_the_nearest_point_is_taken(glass):
     psf = glass_psf(glass, 0.0, MEAN)
-    beyond = psf.of_stars(np.array([-50.25]), np.array([400.25]), MEAN, np.ones(1))
-    edge = psf.of_stars(np.array([0.0]), np.array([255.0]), MEAN, np.ones(1))
+    beyond = psf.stamps_at(np.array([-50.25]), np.array([400.25]), MEAN, np.ones(1))
+    edge = psf.stamps_at(np.array([0.0]), np.array([255.0]), MEAN, np.ones(1))
     # another place in its pixel
     assert moments(beyond[0])[3:] == pytest.approx(moments(edge[0])[3:], rel=1e-2)
     assert beyond.sum() == pytest.approx(edge.sum(), rel=1e-6)
@@ -117,7 +115,7 @@ def test_few_points_and_points_on_a_line_will_do(places):
     points = np.column_stack([places, np.full(len(places), np.nan), np.zeros(len(places))])
     psf = glass_psf(glass_of(Stack(images, points, facts_of(len(places)), 4)), 0.0, np.ones(1))
     x, y = places[-1]
-    light = psf.of_stars(
+    light = psf.stamps_at(
         np.array([float(x), x + 40]), np.array([float(y), y]), np.ones(1), np.ones(2)
     )
     assert moments(light[0])[1:] == pytest.approx(
@@ -147,8 +145,8 @@ def test_light_outside_the_stamps_is_missing_from_a_star(glass):
     psf = glass_psf(replace(glass, outside=np.full_like(glass.outside, 0.03)), 0.0, MEAN)
     at = np.array([128.0]), np.array([128.0])
     full = glass_psf(glass, 0.0, MEAN)
-    assert psf.of_stars(*at, MEAN, np.ones(1)).sum() == pytest.approx(
-        0.97 * full.of_stars(*at, MEAN, np.ones(1)).sum(), rel=1e-5
+    assert psf.stamps_at(*at, MEAN, np.ones(1)).sum() == pytest.approx(
+        0.97 * full.stamps_at(*at, MEAN, np.ones(1)).sum(), rel=1e-5
     )
     assert psf.centroids_px(*at, MEAN)[2] == pytest.approx(full.centroids_px(*at, MEAN)[2])
 
@@ -158,7 +156,7 @@ def test_a_corner_that_is_vignetted_whole_is_dark(glass):
     dark[0] = 0.0
     psf = glass_psf(replace(glass, illumination=dark), 0.0, MEAN)
     at = np.array([0.0, 255.0]), np.array([0.0, 255.0])
-    light = psf.of_stars(*at, MEAN, np.ones(2)).sum(axis=(1, 2))
+    light = psf.stamps_at(*at, MEAN, np.ones(2)).sum(axis=(1, 2))
     assert light[0] == pytest.approx(0, abs=1e-9)
     assert light[1] == pytest.approx(illumination(255, 255), rel=1e-5)
     x, y, relative = psf.centroids_px(*at, MEAN)
@@ -168,7 +166,7 @@ def test_a_corner_that_is_vignetted_whole_is_dark(glass):
 def test_a_field_without_stars_has_no_light(glass):
     nowhere = np.empty(0)
     assert (
-        glass_psf(glass, 0.0, MEAN).of_stars(nowhere, nowhere, np.empty((0, 4)), nowhere).shape[0]
+        glass_psf(glass, 0.0, MEAN).stamps_at(nowhere, nowhere, np.empty((0, 4)), nowhere).shape[0]
         == 0
     )
 
@@ -200,7 +198,7 @@ def test_a_wider_glass_is_its_basis_blurred(glass):
     psf = glass_psf(glass, 0.0, MEAN)
     at = np.array([200.0]), np.array([40.0])
     before, after = (
-        moments(one.of_stars(*at, MEAN, np.ones(1))[0]) for one in (psf, psf.blurred(0.7))
+        moments(one.stamps_at(*at, MEAN, np.ones(1))[0]) for one in (psf, psf.blurred(0.7))
     )
     assert after[3:] - before[3:] == pytest.approx([0.49, 0.49], abs=5e-3)
     assert after[:3] == pytest.approx(before[:3], abs=5e-4)

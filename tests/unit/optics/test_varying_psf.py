@@ -1,0 +1,105 @@
+"""What every PSF offers to those who draw, and that one that varies is drawn by it alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.display.footprints import FootprintMap
+from hilstar.display.render.backend import Target, as_maps
+from hilstar.optics.psf import GaussianPsf, SampledPsf
+from hilstar.optics.sprites import pack_sprites
+from hilstar.server.bench.least_psf import ONE_PSF, WHOLE, candidates
+from tests.support.psfs import gaussian, sampled
+
+SIDE_PX = 64
+SIZE_PX = (SIDE_PX, SIDE_PX)
+X_PX, Y_PX = np.array([12.3, 40.8]), np.array([20.6, 31.2])
+RATES_E_PER_S = np.array([1e3, 2e4])
+ONE_WAVELENGTH = np.ones(1)
+
+
+class Vignetted(GaussianPsf):
+    """A Gaussian that has half the light in the right half of the image: no glass of any file."""
+
+    by_place, by_colour = True, True
+    footprint_px = 11
+
+    @staticmethod
+    def _light(x_px):
+        return np.where(x_px > SIDE_PX / 2, 0.5, 1.0)
+
+    def stamps_at(self, x_px, y_px, spectra, electrons_per_s=None):
+        """Half of the light on the right."""
+        stamps = super().stamps_at(x_px, y_px, spectra, electrons_per_s)
+        return stamps * self._light(x_px).astype(np.float32)[:, None, None]
+
+    def image(self, x_px, y_px, spectra, electrons_per_s, resolution_px):
+        """Half of the light on the right."""
+        rates = electrons_per_s * self._light(x_px)
+        return super().image(x_px, y_px, spectra, rates, resolution_px)
+
+
+class Even(Vignetted):
+    """The same in a square that has no middle pixel."""
+
+    footprint_px = 10
+
+
+def sprites_of(psf):
+    """Two stars with a spectrum, one on each side."""
+    none = np.zeros(2, int)
+    sprites = pack_sprites(X_PX, Y_PX, RATES_E_PER_S, none, SIZE_PX, psf.footprint_px)
+    return replace(sprites, spectra=ONE_WAVELENGTH)
+
+
+def test_a_psf_of_any_class_that_varies_is_drawn_as_a_map_of_its_own_light():
+    psf = Vignetted((0.8, 0.8))
+    light = as_maps(sprites_of(psf), Target(SIZE_PX, psf))
+    (image,) = (part.image for part in light.extended)
+    assert len(light) == 0
+    assert image[:, : SIDE_PX // 2].sum() == pytest.approx(1e3, rel=1e-5)
+    assert image[:, SIDE_PX // 2 :].sum() == pytest.approx(1e4, rel=1e-5)
+
+
+def test_a_psf_of_any_class_that_varies_has_footprints_of_its_own_light():
+    psf = Vignetted((0.8, 0.8))
+    footprints = FootprintMap(SIZE_PX, psf).find(sprites_of(psf))
+    plain = FootprintMap(SIZE_PX, psf).find(replace(sprites_of(psf), spectra=None))
+    drawn_share = footprints.light.sum(axis=0) / plain.light.sum(axis=0)
+    assert drawn_share == pytest.approx([1.0, 0.5], rel=1e-5)
+
+
+def test_a_varying_psf_of_an_even_footprint_is_refused_where_pixels_are_chosen():
+    psf = Even((0.8, 0.8))
+    with pytest.raises(InputError, match="footprint of 10 px, not odd"):
+        FootprintMap(SIZE_PX, psf).find(sprites_of(psf))
+
+
+@pytest.mark.parametrize(
+    "psf", [GaussianPsf((0.7, 0.9)), SampledPsf(sampled(gaussian(0.8, 0.8), 8, 5), 8)]
+)
+def test_a_psf_that_is_the_same_everywhere_keeps_the_contract(psf):
+    stamps = psf.stamps_at(X_PX, Y_PX, psf.mean_shares)
+    image = psf.image(X_PX, Y_PX, psf.mean_shares, RATES_E_PER_S, SIZE_PX)
+    before_px = stamps.shape[1] // 2
+    summed = np.zeros((SIDE_PX, SIDE_PX))
+    for x_px, y_px, rate, stamp in zip(X_PX, Y_PX, RATES_E_PER_S, stamps, strict=True):
+        left, top = round(x_px) - before_px, round(y_px) - before_px
+        place = (slice(top, top + len(stamp)), slice(left, left + len(stamp)))
+        summed[place] += rate * stamp
+    assert image == pytest.approx(summed, abs=1e-4 * RATES_E_PER_S.max())
+    assert image.sum() == pytest.approx(RATES_E_PER_S.sum(), rel=1e-4)
+    x_px, y_px, light = psf.centroids_px(X_PX, Y_PX, psf.mean_shares)
+    assert (x_px.tolist(), y_px.tolist()) == (X_PX.tolist(), Y_PX.tolist())
+    assert light.tolist() == [1.0, 1.0]
+    assert psf.in_the_middle is psf
+    assert [name for name, _ in candidates(psf)] == ["a Gaussian", ONE_PSF]
+
+
+def test_what_may_stand_for_a_varying_psf_ends_with_itself_by_that_name():
+    psf = Vignetted((0.8, 0.8))
+    name, make = list(candidates(psf))[-1]
+    assert name == WHOLE
+    assert make() is psf

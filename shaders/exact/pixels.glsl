@@ -97,7 +97,23 @@ Near pixels_of(Star star, float of_light) {
     return near;
 }
 
-#ifndef PATHS
+#ifdef PATHS
+// `error` of light and moments, in steps, and that of the pixels nearest to this sprite of a path that are not chosen, most of
+// them dark.
+vec3 error_beyond(Near near, vec3 error) {
+    for (int k = near.reach; k < footprint; k++) {
+        ivec2 offset = offset_of(ORDER_AT(near.first + k));
+        if (!nearest_in_path(vec2(offset))) continue;
+        ivec2 at = near.star.pixel + offset;
+        float asked = asked_of(at, own_light_at(near.star, offset));
+        if (asked < 0.0) continue;
+        float factor = output_of(at);
+        vec3 arm = vec3(1.0, vec2(offset) - near.star.fraction);
+        error += (light_of(level_at(at)) - min(asked / factor FLOOR_LIGHT(at), light_of(white))) * factor / light_of(1) * arm;
+    }
+    return error;
+}
+#else
 // `error` of light and moments, in steps, and that of the pixels that are not chosen.
 vec3 error_beyond(Near near, vec3 error) {
     vec3 seen = near.seen;

@@ -191,7 +191,9 @@ def code_stars(
 @lru_cache(maxsize=32)
 def _grid(psf: Psf, seen: Seen, path_px: float, number: int) -> PhaseGrid:
     steps, spread = np.arange(PHASES), spread_phases(PHASES)
-    x_px, y_px = ((steps + first) / PHASES - 0.5 for first in GRIDS[number])
+    first_x, first_y = GRIDS[number]
+    x_px = (steps + first_x) / PHASES - 0.5
+    y_px = (steps + first_y) / PHASES - 0.5
     phases = Phases(x_px, y_px, spread, spread, WAYS_RAD[number])
     return _grid_of(psf, seen, path_px, phases)
 
@@ -206,10 +208,9 @@ def _grid_of(psf: Psf, seen: Seen, path_px: float, phases: Phases) -> PhaseGrid:
     tile = psf.footprint_px + MARGIN_PX + 2 * math.ceil(path_px / 2)
     middles = (np.arange(PHASES) + 0.5) * tile - 0.5
     places = middles + phases.x_px, middles + phases.y_px
-    ways = math.cos(phases.way_rad), math.sin(phases.way_rad)
-    x_px, y_px = (
-        axis[..., None] + along * way for axis, way in zip(np.meshgrid(*places), ways, strict=True)
-    )
+    middle_x, middle_y = np.meshgrid(*places)
+    x_px = middle_x[..., None] + along * math.cos(phases.way_rad)
+    y_px = middle_y[..., None] + along * math.sin(phases.way_rad)
     flux = np.full(PHASES**2, WHITE / psf.peak_share)[:, None] * nodes.share
     star = np.repeat(np.arange(PHASES**2), len(along))
     size_px = PHASES * tile, PHASES * tile
@@ -217,11 +218,11 @@ def _grid_of(psf: Psf, seen: Seen, path_px: float, phases: Phases) -> PhaseGrid:
         x_px.ravel(), y_px.ravel(), flux.ravel(), star, size_px, psf.footprint_px
     )
     sprites = replace(sprites, per_star=len(along))
-    bright = sum(
-        phase_image(_every(sprites, first, len(along)), psf, tile) for first in range(len(along))
-    )
+    bright = np.zeros(size_px)
+    for first in range(len(along)):
+        bright += phase_image(_every(sprites, first, len(along)), psf, tile)
     judge = Judge(
-        np.asarray(bright),
+        bright,
         places,
         psf.width_px,
         seen.blur_px,
@@ -229,7 +230,7 @@ def _grid_of(psf: Psf, seen: Seen, path_px: float, phases: Phases) -> PhaseGrid:
         box_share=NO_THRESHOLD,
         phases=(phases.seen_x, phases.seen_y),
     )
-    return PhaseGrid(phases, sprites, np.asarray(bright), tile, judge)
+    return PhaseGrid(phases, sprites, bright, tile, judge)
 
 
 def _every(sprites: FrameLight, first: int, step: int) -> FrameLight:

@@ -6,7 +6,7 @@ stars, and stars that are missing. Where no key does alone, pairs of them are tr
 those first whose dearer key costs less.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -204,14 +204,24 @@ def would_do(bench: Bench) -> list[Remedy]:
         return []
     trials = _Trials(bench)
     alone = [_first_within(trials, way(trials.start)) for way in trials.ways]
-    found = [_remedy(trials, trial) for trial in alone if trial is not None]
+    found = _remedies(trials, alone)
     if found:
         return found
-    pairs = [_remedy(trials, trial) for trial in _pairs(trials)]
+    pairs = _remedies(trials, _pairs(trials))
     if pairs:
         return pairs
-    largest = [_largest(way, trials.start) for way in trials.ways]
-    return [_remedy(trials, trial) for trial in largest if trial is not None]
+    return _remedies(trials, [_largest(way, trials.start) for way in trials.ways])
+
+
+def _remedies(trials: _Trials, some: Sequence[_Trial | None]) -> list[Remedy]:
+    """What some trials come to, but those that there are none of."""
+    remedies = []
+    for trial in some:
+        if trial is not None:
+            effort = trials.effort(trial)
+            remedy = Remedy(trial.changes, effort.error_mag, effort.error_px, effort.within)
+            remedies.append(remedy)
+    return remedies
 
 
 def _pairs(trials: _Trials) -> list[_Trial]:
@@ -262,8 +272,3 @@ def _largest(way: Callable[[_Trial], Iterator[_Trial]], trial: _Trial) -> _Trial
 
 def _first_within(trials: _Trials, some: Iterator[_Trial]) -> _Trial | None:
     return next((trial for trial in some if trials.effort(trial).within), None)
-
-
-def _remedy(trials: _Trials, trial: _Trial) -> Remedy:
-    effort = trials.effort(trial)
-    return Remedy(trial.changes, effort.error_mag, effort.error_px, effort.within)

@@ -98,10 +98,7 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     float limit = MAX_CARRIED_STEPS * near.largest;  // so that a star that cannot make up for its errors does not accumulate them
     carried = Sums(clamp(carried.a, -limit, limit), clamp(carried.b, -limit, limit), clamp(carried.c, -limit, limit));
 #endif
-    vec3 error = carried.a.xyz;
-#ifndef PATHS
-    error = error_beyond(near, error);
-#endif
+    vec3 error = error_beyond(near, of_light, carried.a.xyz);
     bool equal = near.largest > 0.0 && near.largest <= near.smallest * (1.0 + SAME_STEP);
     float hidden = 0.0;  // the part of the light that no choice can show
     if (equal) {

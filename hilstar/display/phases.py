@@ -3,7 +3,7 @@ centroid.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -62,18 +62,19 @@ def line_places(sprites: FrameLight) -> tuple[FloatArray, FloatArray]:
     return sprites.x_px[:count], sprites.y_px[::count]
 
 
-def phase_image(sprites: FrameLight, psf: Psf) -> FloatArray:
+def phase_image(sprites: FrameLight, psf: Psf, tile_px: int | None = None) -> FloatArray:
     """The light (h, w) of the stars of a `phase_grid`: all are as bright, and stand in columns
-    and rows.
+    and rows of tiles of `tile_px`, by default those of `phase_grid`.
     """
     count = math.isqrt(len(sprites))
+    tile = sprites.footprint_px + MARGIN_PX if tile_px is None else tile_px
     at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
     pixels, offsets = [], []
     for axis, places in enumerate(line_places(sprites)):
         line = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
         pixels.append(line.ravel())
         offsets.append((line - places[:, None]).ravel())
-    image = np.zeros((count * (sprites.footprint_px + MARGIN_PX),) * 2)
+    image = np.zeros((count * tile,) * 2)
     shares = psf.shares(offsets[0][None], offsets[1][:, None])
     image[np.ix_(pixels[1], pixels[0])] = float(sprites.data["electrons_per_s"][0]) * shares
     return image
@@ -83,7 +84,7 @@ def fainter(sprites: FrameLight, mag: float | FloatArray) -> FrameLight:
     """The same stars, `mag` magnitudes fainter: all, or each by its own (n,)."""
     data = sprites.data.copy()
     data["electrons_per_s"] *= flux_ratio(mag)
-    return FrameLight(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
+    return replace(sprites, data=data)
 
 
 def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:

@@ -75,7 +75,8 @@ class Judge:
     `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a
     column of tiles at an
     x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in
-    monitor pixels, and `box_share` the threshold of its boxes.
+    monitor pixels, and `box_share` the threshold of its boxes. `phases` (count,) along x and y say
+    where in a tracker's pixel the stars of a column and of a row are, by default anywhere.
     """
 
     def __init__(
@@ -87,9 +88,11 @@ class Judge:
         pixel_px: float,
         *,
         box_share: float = BOX_SHARE,
+        phases: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         self._box_share = box_share
         self._count = len(places_px[0])
+        self._phases = phases or (spread_phases(self._count),) * 2
         self._tile, self._pixel_px = len(wanted) // self._count, pixel_px
         self._in_tile_px = [place - self._tile * np.arange(self._count) for place in places_px]
         self._sampled_px = max(pixel_px, FINEST_PX)
@@ -155,8 +158,8 @@ class Judge:
 
     def _views_of(self, pixel_px: float, blur_px: float, half: int) -> list[FloatArray]:
         return [
-            _collected(place_px, self._tile, pixel_px, blur_px, half)
-            for place_px in self._in_tile_px
+            _collected(place_px, self._tile, pixel_px, blur_px, half, phase)
+            for place_px, phase in zip(self._in_tile_px, self._phases, strict=True)
         ]
 
     def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
@@ -196,13 +199,16 @@ def stamp_errors(
     is shown.
     """
     count, side = wanted.shape[:2]
+    phases = spread_phases(count)
     at, light = np.arange(side), wanted.sum(axis=(1, 2))
     middles = wanted.sum(axis=1) @ at / light, wanted.sum(axis=2) @ at / light
     sampled_px, blur_px = max(pixel_px, FINEST_PX), max(blur_px, MIN_BLUR_PX)
     x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) / sampled_px for sigma in sigma_px)
 
     def seen(images: FloatArray, width_px: float, half: int) -> FloatArray:
-        columns, rows = (_collected(middle, side, width_px, blur_px, half) for middle in middles)
+        columns, rows = (
+            _collected(middle, side, width_px, blur_px, half, phases) for middle in middles
+        )
         return rows @ images @ columns.transpose(0, 2, 1)
 
     half = max(BOX_SIDE // 2, math.ceil(side / 2 / sampled_px))
@@ -226,16 +232,25 @@ def stamp_errors(
     return off_px
 
 
+def spread_phases(count: int) -> FloatArray:
+    """Places (count,) within a pixel, -0.5 to 0.5, spread evenly by the golden ratio."""
+    return np.asarray((np.arange(count) * GOLDEN) % 1.0 - 0.5)
+
+
 def _collected(
-    star_px: FloatArray, side: int, pixel_px: float, blur_px: float, half: int
+    star_px: FloatArray,
+    side: int,
+    pixel_px: float,
+    blur_px: float,
+    half: int,
+    phase: FloatArray,
 ) -> FloatArray:
     """What each of 2 half + 1 tracker pixels about a star collects of each of `side` monitor
     pixels, along one axis.
 
     (n, 2 half + 1, side), for stars at places (n,) from the first monitor pixel; each meets the
-    tracker's pixels at a phase of its own.
+    tracker's pixels at its `phase` (n,).
     """
-    phase = (np.arange(len(star_px)) * GOLDEN) % 1.0 - 0.5
     middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
     edges = np.arange(side + 1) - 0.5
     to_left, to_right = (middles[:, :, None] + way * pixel_px / 2 - edges for way in (-1, 1))

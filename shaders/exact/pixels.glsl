@@ -42,6 +42,10 @@ uint place[NEAR + 2];
 #endif
 uint step_of[NEAR + 2];  // the lower level, and in 16 bits how much of the step to the next the light is above it
 
+#ifdef PATHS
+const float FAR = 4.0;
+#endif
+
 // The light of the star, or of its path, in a pixel so far from the star's nearest one.
 float own_light_at(Star star, ivec2 offset) {
 #ifdef PATHS
@@ -77,6 +81,10 @@ void look_at(inout Near near, int k) {
     }
 }
 
+int reach_of(float of_light) {
+    return int(reach_px2 * log(max(of_light * reach_per_e, 1.0)));
+}
+
 // The pixels of a star of that light, or of a sprite of its path, and what is found there.
 Near pixels_of(Star star, float of_light) {
     ivec2 cell = clamp(ivec2((star.fraction + odd) * float(PHASES)), 0, PHASES - 1);
@@ -84,7 +92,7 @@ Near pixels_of(Star star, float of_light) {
     float light_weight = weights.x * (1.0 + few_steps * light_of(1) / max(star.e_per_s, 1e-3 * light_of(1)));
     vec2 off = star.fraction - round(star.fraction);
     Near near = Near(star, (cell.y * PHASES + cell.x) * footprint, 0, 0, BITS(0u), 0.0, NONE, 0.0, light_weight, off, vec3(0.0));
-    near.reach = clamp(int(reach_px2 * log(max(of_light * reach_per_e, 1.0))), fewest, NEAR);
+    near.reach = clamp(reach_of(of_light), fewest, NEAR);
 #ifdef PATHS
     for (int k = 0; k < near.reach; k++) {
         uint here = ORDER_AT(near.first + k);
@@ -97,9 +105,26 @@ Near pixels_of(Star star, float of_light) {
     return near;
 }
 
-#ifndef PATHS
+#ifdef PATHS
+// `error` of light and moments, in steps, and that of the pixels nearest to this sprite of a path that are not chosen, most of
+// them dark. A pixel with less than 1 / FAR of what the last that is chosen has is too faint to count.
+vec3 error_beyond(Near near, float of_light, vec3 error) {
+    int end = min(reach_of(FAR * of_light), footprint);
+    for (int k = near.reach; k < end; k++) {
+        ivec2 offset = offset_of(ORDER_AT(near.first + k));
+        if (!nearest_in_path(vec2(offset))) continue;
+        ivec2 at = near.star.pixel + offset;
+        float asked = asked_of(at, own_light_at(near.star, offset));
+        if (asked < 0.0) continue;
+        float factor = output_of(at);
+        vec3 arm = vec3(1.0, vec2(offset) - near.star.fraction);
+        error += (light_of(level_at(at)) - min(asked / factor FLOOR_LIGHT(at), light_of(white))) * factor / light_of(1) * arm;
+    }
+    return error;
+}
+#else
 // `error` of light and moments, in steps, and that of the pixels that are not chosen.
-vec3 error_beyond(Near near, vec3 error) {
+vec3 error_beyond(Near near, float of_light, vec3 error) {
     vec3 seen = near.seen;
     for (int k = near.reach; k < footprint; k++) {
         ivec2 offset = offset_of(PLACE(k));

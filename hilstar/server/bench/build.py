@@ -171,7 +171,7 @@ class Scene(NamedTuple):
 
 class Display(NamedTuple):
     """What shows a bench's stars: its light, its geometry, its GL; how much of white each star
-    asks for; see `turning_of`.
+    asks for; see `turning_of` and `path_of`.
     """
 
     calibration: Calibration
@@ -179,6 +179,7 @@ class Display(NamedTuple):
     context: Context | None
     drive: FloatArray | float
     turning: float
+    path_px: float
     darkest: float
 
 
@@ -205,6 +206,7 @@ def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
             exposure_frames=file.config.exposure_frames,
             cost=partial(level_cost, context=display.context),
             turning=display.turning,
+            path_px=display.path_px,
         )
         yield Scene(psf, choice, white_e_per_s, light)
 
@@ -254,6 +256,16 @@ def turning_of(config: BenchConfig, on_screen: bool) -> float:
     return (scan.scanout_s + scan.hold_s) / 2 / scan.longest_s
 
 
+def path_of(config: BenchConfig, camera: Camera, on_screen: bool) -> float:
+    """How far a star moves on the monitor while its row is lit, turning at 1 deg/s, px; 0 at
+    rest.
+    """
+    if not turning_of(config, on_screen):
+        return 0.0
+    turned_rad = math.hypot(*TIMED_RATE_RAD_S) * scan_of(config.monitor).hold_s
+    return turned_rad * max(camera.scales_px_rad())
+
+
 def _assembled(
     file: BenchFile,
     stars: Stars,
@@ -275,6 +287,7 @@ def _assembled(
         context=context,
         drive=drive,
         turning=turning_of(file.config, on_screen),
+        path_px=path_of(file.config, camera, on_screen),
         darkest=darkest,
     )
     scenes = _scenes(file, stars, display)

@@ -78,7 +78,7 @@ class Light:
     decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by the table,
     `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns,
     `turning` is how far a star of a frame without paths is from its place, in units of its motion;
-    0 for a scene at rest.
+    0 for a scene at rest; `path_px` is how far one moves while its row is lit, at 1 deg/s.
     """
 
     response: Response
@@ -94,6 +94,7 @@ class Light:
     cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
     measured: FieldCost | None = None
     turning: float = 0.0
+    path_px: float = 0.0
 
     @property
     def panel(self) -> Panel:
@@ -129,9 +130,10 @@ class Light:
     def code_stars(self) -> CodeStars:
         """The catalogue's stars for the worst errors of codes."""
         peaks = self.rates_e_per_s * (self.psf.peak_share / self.white_e_per_s)
-        return code_stars(
+        still = code_stars(
             self.psf, self.seen, self.exposure_frames, self.judges, self.response, peaks
         )
+        return replace(still, path_px=self.path_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +165,15 @@ class Motion:
 
     above_px: float
     choice: Choice
+
+    def beside(self, codes: CodeErrors) -> Choice:
+        """The choice, with what it adds to the codes' worst: a star that is drawn as a point, for
+        it moves less, has the codes of one at rest.
+        """
+        if codes.still_px is None or not math.isfinite(codes.place_px):
+            return self.choice
+        more_px = codes.still_px + self.choice.error_px - codes.place_px
+        return replace(self.choice, error_px=max(more_px, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +242,11 @@ class Effort:
     @cached_property
     def choices(self) -> tuple[Choice, ...]:
         """The choice of each part."""
-        parts = [code_part(self), self.taken.sprites.beside(self.codes), self.taken.motion.choice]
+        parts = [
+            code_part(self),
+            self.taken.sprites.beside(self.codes),
+            self.taken.motion.beside(self.codes),
+        ]
         if self.light.psf_choice is not None:
             parts.append(psf_part(self.light, self.light.psf_choice))
         return (*parts, depth_part(self))
@@ -331,7 +346,7 @@ def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Comb
     codes = worst_errors(stars, one.method, tolerance)
     if not codes.within(tolerance):
         return False
-    parts = [one.sprites.beside(codes), one.motion.choice]
+    parts = [one.sprites.beside(codes), one.motion.beside(codes)]
     if light.psf_choice is not None:
         parts.append(light.psf_choice)
     mag = codes.flux_mag + sum(part.error_mag for part in parts)
@@ -377,6 +392,8 @@ def code_part(effort: Effort) -> Choice:
     if errors.centroider is not None:
         whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
         notes.append(f"as `{errors.centroider}` finds stars{whom}")
+    if errors.turns:
+        notes.append("turning at 1 deg/s")
     if not math.isfinite(errors.flux_mag):
         notes.append("the faintest stars of the catalogue show nothing")
     if method == BEST or (render.quantisation == "auto" and len(_methods(render, light)) == 1):

@@ -11,6 +11,7 @@ from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.least_psf import Choice
 from hilstar.server.bench.would_do import Remedy, would_do
 
+JOIN = " and "  # between the two keys of a remedy
 HEAD = ("part", "choice", "error", "of the tolerance", "saves")
 
 
@@ -32,8 +33,7 @@ def effort_lines(bench: Bench) -> list[str]:
     ]
     lines += [f"{choice.part}: {choice.note}" for choice in effort.choices if choice.note]
     for remedy in would_do(bench):
-        head = "would do" if remedy.within else "would not do alone"
-        lines.append(f"{head}: {_remedy_text(remedy)}")
+        lines.append(f"{_remedy_head(remedy)}: {_remedy_text(remedy)}")
     return lines
 
 
@@ -57,12 +57,18 @@ def _saved(choice: Choice) -> str:
     return f"{choice.saved_ms:.2f} ms" if choice.saved_ms else "-"
 
 
+def _remedy_head(remedy: Remedy) -> str:
+    if not remedy.within:
+        return "would not do alone"
+    return "would do together" if len(remedy.changes) > 1 else "would do"
+
+
 def _remedy_text(remedy: Remedy) -> str:
-    value = list(remedy.value) if isinstance(remedy.value, tuple) else remedy.value
-    shown = json.dumps(value)  # JSON and TOML write these alike
+    # JSON and TOML write these values alike
+    shown = JOIN.join(f"{change.key} = {json.dumps(change.value)}" for change in remedy.changes)
     if not math.isfinite(remedy.error_mag + remedy.error_px):
-        return f"{remedy.key} = {shown} (a star shows nothing)"
-    return f"{remedy.key} = {shown} ({remedy.error_mag:.4f} mag, {remedy.error_px:.4f} px)"
+        return f"{shown} (a star shows nothing)"
+    return f"{shown} ({remedy.error_mag:.4f} mag, {remedy.error_px:.4f} px)"
 
 
 def effort_keys(bench: Bench) -> dict[str, Any]:
@@ -91,9 +97,11 @@ def _choice_keys(choice: Choice) -> dict[str, Any]:
 
 
 def _remedy_keys(remedy: Remedy) -> dict[str, Any]:
+    """The remedy as an object: `key` and `value`; of two keys both names in one, and a list."""
+    values = [change.value for change in remedy.changes]
     return {
-        "key": remedy.key,
-        "value": remedy.value,
+        "key": JOIN.join(change.key for change in remedy.changes),
+        "value": values if len(values) > 1 else values[0],
         "error_mag": _number(remedy.error_mag),
         "error_px": _number(remedy.error_px),
         "within": remedy.within,

@@ -1,18 +1,22 @@
-"""What would bring a bench within its tolerance: one key at a time, tried by the bench's own plan.
+"""What would bring a bench within its tolerance: one key, or two, tried by the bench's own plan.
 
 The keys stand in the order of what they cost a user: nothing that is seen (bits, bit stealing,
 `exact` where it is late), then frames that are right over an exposure only, stars that clip, wider
-stars, and stars that are missing.
+stars, and stars that are missing. Where no key does alone, pairs of them are tried in that order:
+those first whose dearer key costs less.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
 
 import msgspec
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.display.calibration import load_calibration
+from hilstar.display.response import Response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.build import bench_stars, calibration_source, white_of
 from hilstar.server.bench.config import GAUSSIAN, RenderSettings
@@ -25,18 +29,27 @@ BRIGHTER_MAG = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # by which full scale comes 
 WIDER = (1.2, 1.4, 1.7, 2.0)  # times the sprite's sigma
 SHALLOWER_MAG = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # above the faintest star
 DIGITS = 3
+OVER_FRAMES = "temporal"
+MAX_PAIRS = 3  # the cheapest; more would not be read, and each takes half a second to find
 Value = float | bool | str | tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
+class Change:
+    """A key of the bench file, and another value for it."""
+
+    key: str
+    value: Value
+
+
+@dataclass(frozen=True, slots=True)
 class Remedy:
-    """A key of the bench file with another value, and the worst errors that the bench then has.
+    """One or two changes of the bench file, and the worst errors that the bench then has.
 
     An error is infinite where a star still shows nothing.
     """
 
-    key: str
-    value: Value
+    changes: tuple[Change, ...]
     error_mag: float
     error_px: float
     within: bool
@@ -44,157 +57,218 @@ class Remedy:
 
 @dataclass(frozen=True, slots=True)
 class _Trial:
-    """A key with another value, and what the bench's plan is then made of."""
+    """A bench with changes: what of it they may touch."""
 
-    key: str
-    value: Value
     render: RenderSettings
-    light: Light
+    bits: int
+    faintest_v_mag: float
+    changes: tuple[Change, ...] = ()
+
+    def but(self, key: str, value: Value, **changed: Any) -> "_Trial":
+        """The same with one more change."""
+        return replace(self, changes=(*self.changes, Change(key, value)), **changed)
+
+    def rendered(self, key: str, value: Value, **more: Value) -> "_Trial":
+        """The same with another value of a key of [render]."""
+        changed: dict[str, Value] = {key: value, **more}
+        render = msgspec.structs.replace(self.render, **changed)
+        return self.but(f"[render] {key}", value, render=render)
 
 
-@dataclass(frozen=True, slots=True)
-class _Sky:
-    """The stars of a bench, how much of white each asks for, and the relative light of the
-    darkest pixel.
-    """
+class _Trials:
+    """The trials of a bench, and what its plan makes of them."""
 
-    stars: Stars
-    drive: FloatArray | float
-    darkest: float
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._stars: Stars = bench_stars(bench.file.config, bench.file.folder)
+        self._drive: FloatArray | float = 1.0
+        if bench.colours is not None:
+            self._stars = bench.colours.on(self._stars)
+            if self._stars.primaries is not None:
+                self._drive = bench.colours.drive(self._stars.primaries)
+        faintest = float(self._stars.v_mag.max(initial=-99.0))
+        faintest_v_mag = min(bench.file.config.sky.faintest_v_mag, faintest)
+        asked = bench.effort.asked
+        self.start = _Trial(asked, bench.file.config.monitor.bits, faintest_v_mag)
+        self.ways: tuple[Callable[[_Trial], Iterator[_Trial]], ...] = (
+            self._more_bits,
+            self._stolen_bits,
+            self._exact_codes,
+            self._codes_over_frames,
+            self._brighter,
+            self._wider,
+            self._shallower,
+        )
+
+    def effort(self, trial: _Trial) -> Effort:
+        """The plan of a bench with changes."""
+        return plan_effort(trial.render, self._light(trial))
+
+    def _light(self, trial: _Trial) -> Light:
+        light = self._bench.effort.light
+        if trial.render.sprite_sigma_px != self.start.render.sprite_sigma_px:
+            light = replace(light, psf=GaussianPsf(trial.render.sprite_sigma_px))
+        if trial.faintest_v_mag != self.start.faintest_v_mag:
+            shown = self._stars.v_mag <= trial.faintest_v_mag
+            light = replace(light, rates_e_per_s=self._stars.electrons_per_s[shown])
+        white_e_per_s = white_of(trial.render, self._stars, light.psf, self._drive)
+        return replace(
+            light,
+            response=self._response(trial),
+            white_e_per_s=white_e_per_s * self._bench.darkest,
+        )
+
+    def _response(self, trial: _Trial) -> Response:
+        start, stealing = self.start, trial.render.bit_stealing
+        if (trial.bits, stealing) == (start.bits, start.render.bit_stealing):
+            return self._bench.effort.light.response
+        file = self._bench.file
+        source = calibration_source(file.config.monitor, file.folder)
+        return load_calibration(source, trial.bits, bit_stealing=stealing).response
+
+    def _more_bits(self, trial: _Trial) -> Iterator[_Trial]:
+        """More bits, of a response that exists for any number of them."""
+        if not self._bench.calibration.is_formula:
+            return
+        for bits in BITS:
+            more = trial.but("[monitor] bits", bits, bits=bits)
+            if bits > trial.bits and self._exists(more):
+                yield more
+
+    def _stolen_bits(self, trial: _Trial) -> Iterator[_Trial]:
+        bench = self._bench
+        if bench.colours is not None or not bench.calibration.can_steal_bits:
+            return
+        stolen = trial.rendered("bit_stealing", True)
+        if not trial.render.bit_stealing and self._exists(stolen):
+            yield stolen
+
+    def _exists(self, trial: _Trial) -> bool:
+        """Whether there is a response: bits cannot be stolen of many."""
+        try:
+            self._response(trial)
+        except InputError:
+            return False
+        return True
+
+    def _exact_codes(self, trial: _Trial) -> Iterator[_Trial]:
+        """`exact`, where a slow machine or the file has other codes."""
+        if self._bench.effort.quantisation != BEST:
+            yield trial.rendered("quantisation", BEST)
+
+    def _codes_over_frames(self, trial: _Trial) -> Iterator[_Trial]:
+        effort = self._bench.effort
+        if effort.light.exposure_frames > 1 and effort.quantisation != OVER_FRAMES:
+            yield trial.rendered("quantisation", OVER_FRAMES)
+
+    def _brighter(self, trial: _Trial) -> Iterator[_Trial]:
+        """A full scale of fewer electrons: faint stars take more codes, and more bright ones
+        clip.
+        """
+        given = trial.render.flux_at_white_e_per_s
+        for mag in BRIGHTER_MAG:
+            if given is not None:
+                value = float(f"{given * 10 ** (-0.4 * mag):.{DIGITS}g}")
+                yield trial.rendered("flux_at_white_e_per_s", value)
+                continue
+            value = (trial.render.brightest_v_mag or 0.0) + mag
+            if value > self._stars.v_mag.max(initial=0.0):
+                return
+            yield trial.rendered("brightest_v_mag", value)
+
+    def _wider(self, trial: _Trial) -> Iterator[_Trial]:
+        """Stars over more pixels, each of which has its own rounding."""
+        if trial.render.psf != GAUSSIAN:
+            return
+        for factor in WIDER:
+            x, y = (round(sigma * factor, 2) for sigma in trial.render.sprite_sigma_px)
+            yield trial.rendered("sprite_sigma_px", (x, y))
+
+    def _shallower(self, trial: _Trial) -> Iterator[_Trial]:
+        """A catalogue that ends at brighter stars."""
+        brightest = float(self._stars.v_mag.min(initial=99.0))
+        for mag in SHALLOWER_MAG:
+            value = round(trial.faintest_v_mag - mag, 2)
+            if value < brightest:
+                return
+            yield trial.but("[sky] faintest_v_mag", value, faintest_v_mag=value)
 
 
 def would_do(bench: Bench) -> list[Remedy]:
     """Each key that alone brings a bench within its tolerance, with the smallest change that does.
 
-    Where no key alone does, each one's largest change. None for a bench that is within already.
+    Where no key alone does, the cheapest pairs of keys; where no pair does, each key's largest
+    change. None for a bench that is within already.
     """
     if bench.effort.within:
         return []
-    nearest, found = [], []
-    for trials in _trials(bench):
-        effort, trial = None, None
-        for trial in trials:
-            effort = plan_effort(trial.render, trial.light)
-            if effort.within:
-                found.append(_remedy(trial, effort))
-                break
-        if trial is not None and effort is not None and not effort.within:
-            nearest.append((trial, effort))
-    return found or [_remedy(*one) for one in nearest]
+    trials = _Trials(bench)
+    alone = [_first_within(trials, way(trials.start)) for way in trials.ways]
+    found = _remedies(trials, alone)
+    if found:
+        return found
+    pairs = _remedies(trials, _pairs(trials))
+    if pairs:
+        return pairs
+    return _remedies(trials, [_largest(way, trials.start) for way in trials.ways])
 
 
-def _remedy(trial: _Trial, effort: Effort) -> Remedy:
-    return Remedy(trial.key, trial.value, effort.error_mag, effort.error_px, effort.within)
+def _remedies(trials: _Trials, some: Sequence[_Trial | None]) -> list[Remedy]:
+    """What some trials come to, but those that there are none of."""
+    remedies = []
+    for trial in some:
+        if trial is not None:
+            effort = trials.effort(trial)
+            remedy = Remedy(trial.changes, effort.error_mag, effort.error_px, effort.within)
+            remedies.append(remedy)
+    return remedies
 
 
-def _trials(bench: Bench) -> Iterator[Iterator[_Trial]]:
-    """The trials of each key, the smallest change first."""
-    sky = _sky(bench)
-    yield _more_bits(bench)
-    yield _stolen_bits(bench)
-    yield _other_codes(bench)
-    yield _brighter(bench, sky)
-    yield _wider(bench, sky)
-    yield _shallower(bench, sky)
+def _pairs(trials: _Trials) -> list[_Trial]:
+    """The first pairs of keys within the tolerance, each with the smallest changes that do."""
+    found: list[_Trial] = []
+    by_cost = sorted(combinations(range(len(trials.ways)), 2), key=lambda pair: pair[::-1])
+    for pair in by_cost:
+        cheaper, dearer = (trials.ways[place] for place in pair)
+        trial = _smallest_pair(trials, cheaper, dearer)
+        if trial is not None:
+            found.append(trial)
+        if len(found) == MAX_PAIRS:
+            break
+    return found
 
 
-def _sky(bench: Bench) -> _Sky:
-    stars = bench_stars(bench.file.config, bench.file.folder)
-    drive: FloatArray | float = 1.0
-    if bench.colours is not None:
-        stars = bench.colours.on(stars)
-        if stars.primaries is not None:
-            drive = bench.colours.drive(stars.primaries)
-    return _Sky(stars, drive, bench.darkest)
+def _smallest_pair(
+    trials: _Trials,
+    cheaper: Callable[[_Trial], Iterator[_Trial]],
+    dearer: Callable[[_Trial], Iterator[_Trial]],
+) -> _Trial | None:
+    """Of two keys the smallest change of the dearer one with any of the cheaper, and then of the
+    cheaper; None where the largest of both are over the tolerance.
+    """
+    utmost = _largest(cheaper, trials.start)
+    if utmost is None:
+        return None
+    both = _largest(dearer, utmost)
+    if both is None or len({change.key for change in both.changes}) == 1:
+        return None  # both are ways to change the codes
+    if not trials.effort(both).within:
+        return None
+    changed = _first_within(trials, dearer(utmost))
+    if changed is None:
+        return both
+    smallest = changed.changes[-1]
+    for first in cheaper(trials.start):
+        for second in dearer(first):
+            if second.changes[-1] == smallest and trials.effort(second).within:
+                return second
+    return changed
 
 
-def _more_bits(bench: Bench) -> Iterator[_Trial]:
-    """More bits, of a response that exists for any number of them."""
-    config, effort = bench.file.config, bench.effort
-    if not bench.calibration.is_formula:
-        return
-    for bits in BITS:
-        if bits <= config.monitor.bits:
-            continue
-        try:
-            calibration = load_calibration(
-                bench.calibration.name, bits, bit_stealing=config.render.bit_stealing
-            )
-        except InputError:  # bit stealing of so many bits
-            continue
-        light = replace(effort.light, response=calibration.response)
-        yield _Trial("[monitor] bits", bits, effort.asked, light)
+def _largest(way: Callable[[_Trial], Iterator[_Trial]], trial: _Trial) -> _Trial | None:
+    some = list(way(trial))
+    return some[-1] if some else None
 
 
-def _stolen_bits(bench: Bench) -> Iterator[_Trial]:
-    config, effort = bench.file.config, bench.effort
-    if (
-        config.render.bit_stealing
-        or bench.colours is not None
-        or not bench.calibration.can_steal_bits
-    ):
-        return
-    source = calibration_source(config.monitor, bench.file.folder)
-    response = load_calibration(source, config.monitor.bits, bit_stealing=True).response
-    light = replace(effort.light, response=response)
-    render = msgspec.structs.replace(effort.asked, bit_stealing=True)
-    yield _Trial("[render] bit_stealing", True, render, light)
-
-
-def _other_codes(bench: Bench) -> Iterator[_Trial]:
-    """`exact`, where a slow machine or the file has other codes, and `temporal`."""
-    effort = bench.effort
-    methods = (BEST, "temporal") if effort.light.exposure_frames > 1 else (BEST,)
-    for method in methods:
-        if method == effort.quantisation:
-            continue
-        render = msgspec.structs.replace(effort.asked, quantisation=method)
-        yield _Trial("[render] quantisation", method, render, effort.light)
-
-
-def _brighter(bench: Bench, sky: _Sky) -> Iterator[_Trial]:
-    """A full scale of fewer electrons: faint stars take more codes, and more bright ones clip."""
-    effort = bench.effort
-    for mag in BRIGHTER_MAG:
-        if effort.asked.flux_at_white_e_per_s is not None:
-            key = "flux_at_white_e_per_s"
-            value = float(f"{effort.asked.flux_at_white_e_per_s * 10 ** (-0.4 * mag):.{DIGITS}g}")
-        else:
-            key = "brightest_v_mag"
-            value = (effort.asked.brightest_v_mag or 0.0) + mag
-            if value > sky.stars.v_mag.max(initial=0.0):
-                return
-        render = msgspec.structs.replace(effort.asked, **{key: value})
-        white_e_per_s = white_of(render, sky.stars, effort.light.psf, sky.drive) * sky.darkest
-        yield _Trial(
-            f"[render] {key}", value, render, replace(effort.light, white_e_per_s=white_e_per_s)
-        )
-
-
-def _wider(bench: Bench, sky: _Sky) -> Iterator[_Trial]:
-    """Stars over more pixels, each of which has its own rounding."""
-    effort = bench.effort
-    if effort.asked.psf != GAUSSIAN:
-        return
-    for factor in WIDER:
-        x, y = (round(sigma * factor, 2) for sigma in effort.asked.sprite_sigma_px)
-        render, psf = (
-            msgspec.structs.replace(effort.asked, sprite_sigma_px=(x, y)),
-            GaussianPsf((x, y)),
-        )
-        white_e_per_s = white_of(render, sky.stars, psf, sky.drive) * sky.darkest
-        light = replace(effort.light, psf=psf, white_e_per_s=white_e_per_s)
-        yield _Trial("[render] sprite_sigma_px", (x, y), render, light)
-
-
-def _shallower(bench: Bench, sky: _Sky) -> Iterator[_Trial]:
-    """A catalogue that ends at brighter stars."""
-    effort, v_mag = bench.effort, sky.stars.v_mag
-    faintest = min(bench.file.config.sky.faintest_v_mag, float(v_mag.max(initial=-99.0)))
-    for mag in SHALLOWER_MAG:
-        value = round(faintest - mag, 2)
-        kept = v_mag <= value
-        if not kept.any():
-            return
-        light = replace(effort.light, rates_e_per_s=sky.stars.electrons_per_s[kept])
-        yield _Trial("[sky] faintest_v_mag", value, effort.asked, light)
+def _first_within(trials: _Trials, some: Iterator[_Trial]) -> _Trial | None:
+    return next((trial for trial in some if trials.effort(trial).within), None)

@@ -46,6 +46,8 @@ SIGMA = (0.85, 0.85)
 ORION = from_radec_roll_deg(84, -1, 0)
 # float32 of the renderer against the float64 oracle, as tests/gpu/test_renderer.py has it.
 FLOAT32 = 1e-5
+# A tolerance that no key alone brings `round` to.
+PAIRED = {"quantisation": "round", "tolerance_mag": 0.0002, "tolerance_px": 0.002}
 WINGS_SHARE = 0.005  # of lit pixels: 6 of 2136 here with wings twice as high as those allowed
 
 
@@ -303,6 +305,15 @@ def test_a_bench_over_its_tolerance_says_what_would_do(bench_with):
     assert sum(line.startswith("would do: ") for line in lines) == len(keys["would_do"])
 
 
+def changed_by(tables, keys, values):
+    """Tables of a bench with other values of "[table] key"."""
+    changed = {name: dict(table) for name, table in tables.items()}
+    for name, value in zip(keys, values, strict=True):
+        table, key = name.removeprefix("[").split("] ")
+        changed.setdefault(table, {})[key] = value
+    return changed
+
+
 @pytest.mark.parametrize("bits", [8, 10])
 def test_what_would_do_does(bits, tmp_path):
     """Each key that is told is written to the file, whose own plan then has the errors that were
@@ -320,8 +331,7 @@ def test_what_would_do_does(bits, tmp_path):
         told = effort_keys(bench)["would_do"]
     assert len(told) >= 3
     for remedy in told:
-        table, key = remedy["key"].removeprefix("[").split("] ")
-        changed = tables | {table: tables.get(table, {}) | {key: remedy["value"]}}
+        changed = changed_by(tables, [remedy["key"]], [remedy["value"]])
         path.write_text(bench_text(changed))
         with load(path) as mended:
             keys = effort_keys(mended)
@@ -564,3 +574,30 @@ def test_a_timed_bench_takes_the_codes_that_its_machine_holds(small_bench_file, 
         )
         assert bench.config.render.codes_ms == (1.0, 500.0)
         assert bench.draw(ORION).levels.any()
+
+
+def test_where_no_key_does_alone_pairs_do(tmp_path):
+    """16 bits, the deepest that a key asks for, leave 0.0017 mag; each pair is written to the file,
+    whose own plan then is within, and neither key of it does alone.
+    """
+    tables = {"monitor": {"bits": 8}, "render": PAIRED}
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(tables))
+    with load(path) as bench:
+        told = effort_keys(bench)["would_do"]
+        lines = effort_lines(bench)
+    assert told and len(told) <= 3
+    assert sum(line.startswith("would do together: ") for line in lines) == len(told)
+    for remedy in told:
+        names, values = remedy["key"].split(" and "), remedy["value"]
+        assert len(names) == len(values) == 2 and remedy["within"] is True
+        path.write_text(bench_text(changed_by(tables, names, values)))
+        with load(path) as mended:
+            keys = effort_keys(mended)
+        assert keys["within"] is True
+        assert keys["error_mag"] == pytest.approx(remedy["error_mag"], rel=1e-6)
+        assert keys["error_px"] == pytest.approx(remedy["error_px"], rel=1e-6)
+        for name, value in zip(names, values, strict=True):
+            path.write_text(bench_text(changed_by(tables, [name], [value])))
+            with load(path) as half:
+                assert not half.effort.within

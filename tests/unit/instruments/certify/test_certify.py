@@ -286,6 +286,31 @@ def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) 
     assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
 
 
+def test_a_faint_code_that_reads_below_black_does_not_undo_the_others(tmp_path) -> None:
+    """Its light, and so its noise by its light, was 0, and all scatters became infinite: "white
+    reads no light above black".
+    """
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    )
+    file = read_bench_file(path)
+    lit = [1, 20, 40, 80, 120, 160, 200, 255]
+    codes = np.array([0, *lit, 0, *lit, 0, *lit, 0])
+    rng = np.random.default_rng(4)
+    black = 1e4
+    light = black + grey_response(file).light[codes] * 1e6
+    light += np.where(codes > 0, 1e-4 * (light - black), 1.0) * rng.standard_normal(len(codes))
+    light[codes == 1] = black - np.array([30.0, 31.0, 32.0])
+    shape = np.where(codes == 1, 1e9, 1.0)
+    readings = LightReadings(codes, light, np.zeros(len(codes)), noise_shape=shape)
+    deviation = light_deviation(file, readings)
+    off = deviation.value * WHITE_E_PER_S / 1e6 - 1
+    assert np.abs(off[1:]).max() < 1e-3
+    assert np.isfinite(deviation.factors).all()
+    assert deviation.noise == pytest.approx(1e-4, rel=0.5)
+
+
 def test_three_readings_hold_the_truth_by_their_t() -> None:
     rng, trials = np.random.default_rng(3), 4000
     read = rng.normal(0, 1, (trials, 3))

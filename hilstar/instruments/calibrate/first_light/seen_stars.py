@@ -24,7 +24,7 @@ from hilstar.basics.rotation import from_matrix, to_matrix
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
 from hilstar.display.quantise import shown_light
 from hilstar.display.response import Levels
-from hilstar.instruments.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
+from hilstar.instruments.calibrate.first_light.context import MAX_FILL, StepContext
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern
 from hilstar.instruments.calibrate.scale import STAR_MAG
 from hilstar.server.bench.build import open_bench
@@ -355,8 +355,8 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
             f"stars_{number:03}",
             *(f"stars_{number:03}_{again:02}" for again in range(1, frames)),
         ]
-        looked = [context.look(Pattern(name, codes[0], codes[1:]), dark) for name in names]
-        fields.append(_compared(context, looked, wanted, spot))
+        patterns = [Pattern(name, codes[0], codes[1:]) for name in names]
+        fields.append(_compared(context, patterns, dark, wanted, spot))
     arrays = [
         field.name
         for field in dataclasses.fields(StarsSeen)
@@ -398,7 +398,11 @@ def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
 def _mean_dark(context: StepContext, frames: int) -> tuple[FloatArray, tuple[Path, ...]]:
     """The mean of `frames` images of a black screen (h, w), and their files."""
     paths = [context.dark(number) for number in range(frames)]
-    return np.asarray(np.mean([context.read(path) for path in paths], axis=0)), tuple(paths)
+    # One image at a time: twenty of 2048 x 2048 pixels take 0.7 GB.
+    total = context.read(paths[0])
+    for path in paths[1:]:
+        total = total + context.read(path)
+    return total / frames, tuple(paths)
 
 
 def _fields(
@@ -506,11 +510,22 @@ def _codes_mag(
 
 
 def _compared(
-    context: StepContext, looked: list[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot
+    context: StepContext,
+    patterns: list[Pattern],
+    dark: FloatArray,
+    wanted: ExpectedStars,
+    spot: StarSpot,
 ) -> StarsSeen:
     """The stars found in the mean of a field's images, against those that should be there."""
-    image = np.asarray(np.mean([each.image for each in looked], axis=0))
-    background = noisiest_background(image, 1 / len(looked))
+    first = context.look(patterns[0], dark)
+    paths, total = [first.path], first.image
+    for pattern in patterns[1:]:
+        looked = context.look(pattern, dark)
+        paths.append(looked.path)
+        total = total + looked.image
+    images = len(paths)
+    image = total / images
+    background = noisiest_background(image, 1 / images)
     found, noise_dn = find_stars(image, spot.settings, background), background.noise
     seen = np.stack([found.x_px, found.y_px], axis=1)
     count = len(wanted.e_per_s)
@@ -530,11 +545,11 @@ def _compared(
     peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
     chosen = nearest[matched]
     dn = found.flux[chosen] / spot.window_share
-    shared = dataclasses.replace(spot, frames=len(looked))
+    shared = dataclasses.replace(spot, frames=images)
     noise_mag = shared.light_noise_mag(dn, noise_dn)
     whole_dn = np.maximum(dn * spot.window_share, 1e-9)
     rounded = shared.rounded_dn(dn, noise_dn) / whole_dn[:, None]
-    saturated = found.peak[chosen] > MAX_FILL * context.full_dn - looked[0].floor_dn
+    saturated = found.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
     return StarsSeen(
         hip=wanted.hip[matched],
         place_px=wanted.place_px[matched],
@@ -547,6 +562,6 @@ def _compared(
         screen=wanted.screen[matched],
         codes_mag=wanted.codes_mag[matched],
         lost=int((~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)).sum()),
-        frames=len(looked),
-        images=tuple(each.path for each in looked),
+        frames=images,
+        images=tuple(paths),
     )

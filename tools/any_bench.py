@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, PURPLE, RED, TEAL, chart, write_csv
 from tests.support.any_bench.draw import DrawnBench, drawn_bench
 from tests.support.any_bench.judge import (
+    BUSY,
     FAILED,
     GOOD_OUTCOMES,
     HEAVY,
@@ -40,6 +41,7 @@ from tests.support.any_bench.run import LIMIT_S, run_bench
 HEAD, TABLE, CHART = "any_bench.json", "any_bench.csv", "any_bench"
 COLOURS = {
     VERIFIED: GREEN,
+    BUSY: GREEN,
     TOO_WIDE: BLUE,
     REFUSED: PURPLE,
     NOT_VERIFIED: TEAL,
@@ -49,7 +51,7 @@ COLOURS = {
     WRONG: RED,
     TRACEBACK: RED,
 }
-MARKERS = {HEAVY: "s", WRONG: "X", TRACEBACK: "D"}
+MARKERS = {BUSY: "v", HEAVY: "s", WRONG: "X", TRACEBACK: "D"}
 
 
 def main() -> None:

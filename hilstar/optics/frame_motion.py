@@ -74,6 +74,30 @@ class Orientation:
             right, down = down, -right
         return right, down
 
+    def to_screen(
+        self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The screen's pixels (n,) that show pixels (n,) of an image of `resolution_px`."""
+        width, height = resolution_px
+        for _ in range(self.quarter_turns % 4):
+            x_px, y_px = height - 1 - y_px, x_px
+            width, height = height, width
+        x_px = width - 1 - x_px if self.flip_x else x_px
+        y_px = height - 1 - y_px if self.flip_y else y_px
+        return x_px, y_px
+
+    def to_image(
+        self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The pixels (n,) of an image of `resolution_px` that the screen's pixels (n,) show."""
+        width, height = self.screen_px(resolution_px)
+        x_px = width - 1 - x_px if self.flip_x else x_px
+        y_px = height - 1 - y_px if self.flip_y else y_px
+        for _ in range(self.quarter_turns % 4):
+            x_px, y_px = y_px, width - 1 - x_px
+            width, height = height, width
+        return x_px, y_px
+
 
 @dataclass(frozen=True, slots=True)
 class Scan:

@@ -11,8 +11,10 @@ import pytest
 
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame, frame_parts, read_frame
 from hilstar.basics.rotation import normalise
+from hilstar.display.calibration import CalibrationHead, NotesTable, write_calibration
+from hilstar.display.response import srgb_response
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
-from hilstar.instruments.simulate.live_exposure import LiveTracker
+from hilstar.instruments.simulate.live_exposure import TRACKING, LiveTracker
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
@@ -21,6 +23,8 @@ from tests.support.benches import ORION_Q, TWIN, bench_text
 
 ORION = normalise(np.array(ORION_Q))
 FRAMES = 6
+BITS, BLACK = 8, 2e-3  # a glow of 30 DN a detector pixel
+MIN_FOUND = 8
 PERIOD_NS = 16_666_667
 SAME = 1e-6  # of the brightest pixel: both add the same float32 shares, in another order
 
@@ -78,3 +82,27 @@ def test_both_trackers_see_the_same_electrons(tmp_path: Path, rng, monkeypatch, 
         live.expose(exposed)
     assert np.abs(seen[0] - wanted).max() < SAME * wanted.max()
     assert wanted.max() > 1000
+
+
+def test_stars_are_found_on_a_screen_that_glows_over_a_part_of_the_field(tmp_path: Path, rng):
+    """A screen seen whole was one large spot above the dark around it: no star was found."""
+    head = CalibrationHead("photometric", "", "2026-11-28", "", "relative", BITS, "light.csv")
+    light = srgb_response(BITS).light + BLACK
+    write_calibration(tmp_path / "light.toml", head, {"w": light}, 0.0, NotesTable())
+    changes = {
+        "monitor": {"bits": BITS, "calibration": "light.toml"},
+        "tracker": {"focal_length_mm": 12},
+        "tracker.detector": {"offset_dn": 40, "read_noise_e": 12},
+    }
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, changes))
+    file = read_bench_file(tmp_path / "bench.toml")
+    with open_bench(file) as bench, LiveTracker(file, rng) as live:
+        for number in range(FRAMES + 1):
+            live.take(frame_of(bench, number))
+        exposed = live.frames.exposed(0, FRAMES * PERIOD_NS)
+        assert exposed is not None
+        solved = live.solve(exposed)
+        glow_dn = float(np.ptp(live._under_e)) / file.config.tracker.detector.gain_e_per_dn
+    assert glow_dn > 10
+    assert solved.mode == TRACKING
+    assert len(solved.found) >= MIN_FOUND

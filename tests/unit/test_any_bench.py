@@ -27,6 +27,7 @@ from tests.support.any_bench.draw import (
     write_bench,
 )
 from tests.support.any_bench.judge import (
+    ASSESS,
     FIRST_LIGHT,
     SERVE,
     VERIFY,
@@ -115,6 +116,8 @@ def session(**verdicts):
     }
 
 
+DARK = session(orientation="failed")
+DARK["steps"][0]["line"] = "a black screen fills the tracker to 100% of its range"
 DONE = session(geometry="done", verify="done")
 CLAMPED = Comparison(0.15, 0.55, -40.0)
 GONE = result(code=3, stderr="gone")
@@ -185,6 +188,34 @@ PASSED = {"passed": True, "reasons": []}
             {},
             judge.LATER,
             "serve: gone",
+        ),
+        (
+            {
+                FIRST_LIGHT: result(DONE),
+                VERIFY: result(PASSED),
+                SERVE: result({"missed_frames": 300}),
+                ASSESS: result(code=2, stderr="hilstar: the run missed so many frames that 9"),
+            },
+            {},
+            judge.BUSY,
+            "missed so many frames",
+        ),
+        (
+            {
+                FIRST_LIGHT: result(DONE),
+                VERIFY: result(PASSED),
+                SERVE: result({"missed_frames": 0}),
+                ASSESS: result(code=2, stderr="hilstar: 23 valid answers, and 30 are needed"),
+            },
+            {},
+            judge.LATER,
+            "23 valid answers",
+        ),
+        (
+            {FIRST_LIGHT: result(DARK, 1)},
+            {},
+            judge.REFUSED,
+            "a black screen fills the tracker",
         ),
     ],
 )

@@ -158,6 +158,8 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         # What a black image adds to a reading's noise is in its shape.
         bright = ~dark
     by_shape = lit * shape
+    # A code whose readings average below black has no noise of light, only that of black.
+    bright &= by_shape > 0
     noise, floor = 1.0, 0.0
     for _ in range(3):
         sigma = np.hypot(noise * by_shape, max(floor, 1e-9 * mean[-1] * noise))

@@ -18,7 +18,12 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 from hilstar.display.quantise import shown_light
-from hilstar.instruments.certify.readings import geometry_of, grey_response, white_of
+from hilstar.instruments.certify.readings import (
+    geometry_of,
+    grey_response,
+    in_true_image,
+    white_of,
+)
 from hilstar.instruments.simulate.optics import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import bench_calibration, open_bench
@@ -254,22 +259,21 @@ class Figures:
 def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
     """The deviations of a bench whose truth is known (b = 1), at its reference stars."""
     file = figures.file
-    mine, its, (width, height) = (
-        grey_response(file),
-        grey_response(truth),
-        file.config.monitor.resolution_px,
-    )
+    mine, its = grey_response(file), grey_response(truth)
     levels = np.interp(figures.log_light, np.log(mine.light[1:]), its.light[1:] / mine.light[1:])
     levels *= white_of(truth) / white_of(file)
-    rows, columns = np.rint(figures.y_px).astype(np.intp), np.rint(figures.x_px).astype(np.intp)
     even = np.zeros(len(figures.stars))
-    for sign, bench in ((1, truth), (-1, file)):
-        known = bench_calibration(bench.config, bench.folder).uniformity_map((width, height))
+    rays = []
+    here_px = figures.x_px, figures.y_px
+    places_px = in_true_image(file, truth, *here_px), here_px
+    for sign, bench, (x_px, y_px) in zip((1, -1), (truth, file), places_px, strict=True):
+        size_px = bench.config.monitor.resolution_px
+        known = bench_calibration(bench.config, bench.folder).uniformity_map(size_px)
         if known is not None:
-            even += sign * np.log(known[rows, columns].astype(np.float64))
-    shown, wanted = (
-        geometry_of(each).monitor.rays(figures.x_px, figures.y_px) for each in (truth, file)
-    )
+            row, column = np.rint(y_px).astype(np.intp), np.rint(x_px).astype(np.intp)
+            even += sign * np.log(known[row, column].astype(np.float64))
+        rays.append(geometry_of(bench).monitor.rays(x_px, y_px))
+    shown, wanted = rays
     place = (shown[:, :2] / shown[:, 2:] - wanted[:, :2] / wanted[:, 2:]) * ARCSEC_PER_RAD
     delay = np.array([truth.config.monitor.panel_delay_ms])
     return Deviations(levels[None], even[None], place[None], delay, np.zeros(1))

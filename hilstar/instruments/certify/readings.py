@@ -48,6 +48,7 @@ DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could satur
 WATCHED_S = 5.0
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
 NO_LIGHT_DN_PER_S = 1e-9
+STEP_PX = 10.0  # of the screen, by which the mounting of a truth is compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +145,7 @@ class VirtualReader:
 
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
         image_sources.refuse_other_bench(file, truth)
-        if orientation_of(file.config.monitor) != orientation_of(truth.config.monitor):
+        if not _is_mounted_alike(file, truth):
             raise InputError(
                 f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar"
                 " first-light)"
@@ -184,13 +185,13 @@ class VirtualReader:
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """The dots' places by the truth's lens, with noise."""
         x, y = x_px.astype(np.float64), y_px.astype(np.float64)
+        true_x, true_y = in_true_image(self.file, self.truth, x, y)
         less = 1 / math.sqrt(images)
-        seen = geometry_of(self.truth).to_tracker(x, y)
-        light = (
-            np.ones(len(x))
-            if self._uniformity is None
-            else self._uniformity[y_px, x_px].astype(np.float64)
-        )
+        seen = geometry_of(self.truth).to_tracker(true_x, true_y)
+        light = np.ones(len(x))
+        if self._uniformity is not None:
+            row, column = true_y.astype(np.intp), true_x.astype(np.intp)
+            light = self._uniformity[row, column].astype(np.float64)
         light *= 1 + less * self._noise.reading_noise * self._rng.standard_normal(len(x))
         seen_x, seen_y = (
             part + less * self._noise.dot_noise_px * self._rng.standard_normal(len(x))
@@ -214,6 +215,34 @@ class VirtualReader:
         return delays_of(
             image_sources.virtual_diode(self.file, self.truth, WATCHED_S, self._rng), self.file
         )
+
+
+def in_true_image(
+    file: BenchFile, truth: BenchFile, x_px: FloatArray, y_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The pixels (n,) of the truth's image that are those of the bench file's, on one screen.
+
+    A screen can be stated in several ways: flipped both ways it is turned by 180 degrees, and
+    turned by nearly 45 degrees it may be taken for a quarter turn.
+    """
+    mine, its = file.config.monitor, truth.config.monitor
+    on_screen = orientation_of(mine).to_screen(x_px, y_px, mine.resolution_px)
+    return orientation_of(its).to_image(*on_screen, its.resolution_px)
+
+
+def _is_mounted_alike(file: BenchFile, truth: BenchFile) -> bool:
+    """Whether steps right and down the image go the same way in the tracker by both files, to 45
+    degrees, as they do after the step `orientation`.
+    """
+    width, height = file.config.monitor.resolution_px
+    x_px = np.array([0.0, STEP_PX, 0.0]) + (width - 1) / 2
+    y_px = np.array([0.0, 0.0, STEP_PX]) + (height - 1) / 2
+    stated = np.stack(geometry_of(file).to_tracker(x_px, y_px))
+    true = np.stack(geometry_of(truth).to_tracker(*in_true_image(file, truth, x_px, y_px)))
+    steps, true_steps = (each[:, 1:] - each[:, :1] for each in (stated, true))
+    lengths = np.linalg.norm(steps, axis=0) * np.linalg.norm(true_steps, axis=0)
+    cosines = (steps * true_steps).sum(axis=0) / lengths
+    return bool((cosines > math.cos(math.pi / 4)).all())
 
 
 def white_of(file: BenchFile) -> float:

@@ -36,7 +36,12 @@ from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.sky.stars import split_by_rate
-from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.centroids import (
+    CentroidSettings,
+    LocalBackground,
+    find_stars,
+    noisiest_background,
+)
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
 from hilstar.tracker.mosaic import software_image, software_psf_px
@@ -47,6 +52,7 @@ SEEN_SIGMAS = 3.0  # in a pixel's noise: fainter stars are not expected in an im
 MAX_EXPECTED = 300  # brightest stars that are
 MAX_REPORTED = 30  # stars
 BLINDED_SHARE = 0.05  # detector pixels at the last code
+EVEN_DARK_DN = 1.0  # a step of the ADC, from the darkest pixel of a black screen to the brightest
 STREAK_PX = 0.5  # from this streak on, the window is as wide as it, and no S-curve is removed
 MAX_WINDOW_PX = 6.0
 # an attitude older than this predicts no other; two further apart than that tell no rate
@@ -199,11 +205,25 @@ class LiveTracker(Closing):
         glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
         self._under_e = glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
         self._bench_exposure_s, self._gain_db = self.exposure_s, 0.0
+        self._dark_dn = self._uneven_dark_dn()
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
         self.refused = 0
         self.frames = WatchedFrames(self._light)
+
+    def _uneven_dark_dn(self) -> FloatArray | None:
+        """What a black screen is in the software's image (h, w), DN; None where that is even.
+
+        A screen that is seen whole glows over a part of the field, which is one large spot to a
+        tracker that takes one level for the whole image.
+        """
+        detector = self._detector.settings
+        full_dn = 2**detector.bits - 1
+        under_e = self._under_e * (self.exposure_s / self._bench_exposure_s)
+        dark_dn = detector.offset_dn + under_e / detector.gain_e_per_dn
+        dark_dn = software_image(np.clip(dark_dn, 0.0, full_dn), detector)
+        return dark_dn if np.ptp(dark_dn) > EVEN_DARK_DN else None
 
     def _light(self, frame: ShownFrame) -> FloatArray:
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
@@ -240,14 +260,14 @@ class LiveTracker(Closing):
 
     def adjust(self, exposure_s: float, gain_db: float) -> None:
         """Expose for `exposure_s`, with a gain over the bench file's, as a camera's client asks."""
-        self.exposure_s = exposure_s
-        if gain_db == self._gain_db:
+        if (exposure_s, gain_db) == (self.exposure_s, self._gain_db):
             return
+        self.exposure_s, self._gain_db = exposure_s, gain_db
         tracker = self.config.tracker
         gain_e_per_dn = tracker.detector.gain_e_per_dn / 10 ** (gain_db / 20)
         settings = msgspec.structs.replace(tracker.detector, gain_e_per_dn=gain_e_per_dn)
         self._detector = Detector(settings, tracker.resolution_px, tracker.pixel_pitch_um)
-        self._gain_db = gain_db
+        self._dark_dn = self._uneven_dark_dn()
 
     def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
         """The DN of an exposure."""
@@ -317,10 +337,14 @@ class LiveTracker(Closing):
         )
         still = streak_px <= STREAK_PX
         image = software_image(dn, self.config.tracker.detector)
-        seen = find_stars(
-            image,
-            CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px if still else None),
+        background: LocalBackground | None = None
+        if self._dark_dn is not None:
+            image = image - self._dark_dn
+            background = noisiest_background(image)
+        settings = CentroidSettings(
+            window_sigma_px=window_px, psf_sigma_px=psf_px if still else None
         )
+        seen = find_stars(image, settings, background)
         good = ~seen.at_edge
         x_px, y_px = seen.x_px[good], seen.y_px[good]
         flux_e = seen.flux[good] * self.config.tracker.detector.gain_e_per_dn

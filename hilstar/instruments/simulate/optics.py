@@ -29,7 +29,7 @@ from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
 POINTS_AT_ONCE = 400_000
-# of a glow, whose dozen arrays would take 2 GB of a detector of 4096 x 4096 px
+# of a glow or of places, whose dozen arrays would take 2 GB of a detector of 4096 x 4096 px
 PIXELS_AT_ONCE = 500_000
 
 
@@ -60,6 +60,16 @@ class BenchGeometry:
         """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the
         monitor.
         """
+        if np.size(x_px) <= PIXELS_AT_ONCE:
+            return self._to_monitor(x_px, y_px)
+        # A whole detector of 2048 x 2048 pixels at once takes 1 GB, mostly of intermediate values.
+        seen_px = np.empty((2, len(x_px)))
+        for begin in range(0, len(x_px), PIXELS_AT_ONCE):
+            part = slice(begin, begin + PIXELS_AT_ONCE)
+            seen_px[:, part] = self._to_monitor(x_px[part], y_px[part])
+        return seen_px[0], seen_px[1]
+
+    def _to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
 
     def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,6 +9,8 @@ import csv
 import gzip
 import io
 import math
+import struct
+import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,7 +35,8 @@ MAX_DEGREE = 9  # the convention's
 FITTED, HELD_OUT = 28, 25
 
 Keywords = dict[str, str | float]
-AFTER_HEADER = 33  # bytes of a PNG up to the end of its first chunk
+PNG_GREY, PNG_RGB = 0, 2  # colour types
+PNG_LEVEL = 1  # 6 takes twelve times as long for a noisy frame and saves 5 %
 PREVIEW_RADIUS_PX = 9  # the brightest star's
 PREVIEW_BLUR_PX = 0.7
 PREVIEW_POWER = 0.35
@@ -291,21 +294,25 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
     """A PNG of values (height, width) or (height, width, 3), uint8 or uint16, of which `meant_bits`
     mean something (sBIT).
 
-    Its rows are not filtered: a tracker's frame, which is noise, takes half the time of Pillow's
-    PNG, and 12 % fewer bytes.
+    Its rows are not filtered, and are compressed at once: a tracker's frame, which is noise, takes
+    a third of the time that `png.Writer` takes row by row.
     """
     import png
 
     height, width = image.shape[:2]
     rows = np.ascontiguousarray(image, f">u{image.itemsize}").view(np.uint8).reshape(height, -1)
-    data, about = io.BytesIO(), io.BytesIO()
-    png.Writer(
-        width, height, bitdepth=8 * image.itemsize, greyscale=image.ndim == 2, compression=1
-    ).write_packed(data, rows)
+    scanlines = np.zeros((height, 1 + rows.shape[1]), np.uint8)  # each begins with its filter: none
+    scanlines[:, 1:] = rows
+    colour_type, channels = (PNG_GREY, 1) if image.ndim == 2 else (PNG_RGB, 3)
+    header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, colour_type, 0, 0, 0)
+    chunks = [(b"IHDR", header)]
     if meant_bits is not None:
-        png.write_chunk(about, b"sBIT", bytes([meant_bits] * (1 if image.ndim == 2 else 3)))
-    whole = data.getvalue()
-    return whole[:AFTER_HEADER] + about.getvalue() + whole[AFTER_HEADER:]
+        chunks.append((b"sBIT", bytes([meant_bits] * channels)))
+    chunks.append((b"IDAT", zlib.compress(scanlines.data, PNG_LEVEL)))
+    chunks.append((b"IEND", b""))
+    file = io.BytesIO()
+    png.write_chunks(file, chunks)
+    return file.getvalue()
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:

@@ -21,9 +21,10 @@ from tests.support.commands import run_hilstar_here
 SEED, SMALL_SEED = 1, 48
 # A microdisplay of which the tracker sees 2 %, before 256 x 256 pixels with a PSF of 2.1 px.
 NUMBERS = (16,)
-# Turned by 29 degrees and mirrored; a PSF of 2.0 px; even light, on its side, seen whole; an
-# S-curve and a wide field.
-SMALL_NUMBERS = (3, 17, 18, 22)
+# Turned by 29 degrees, mirrored, of 10 bits; seen twice over, with a PSF of 0.36 px, a black level of
+# 8e-4 and hot pixels; a PSF of 2.0 px; even light, on its side, seen whole; an S-curve and a wide
+# field; of 10 bits, with hot pixels and light that falls by 0.19.
+SMALL_NUMBERS = (3, 7, 17, 18, 22, 26)
 PLACES = {"focus", "warm-up", "geometry", "scale", "latency"}
 
 

@@ -52,8 +52,13 @@ NOT_VERIFIED, FAILED, LATER, WRONG = (
     "wrong figure",
 )
 HEAVY, TRACEBACK = "over 2 GB", "traceback"
-OUTCOMES = (VERIFIED, TOO_WIDE, REFUSED, NOT_VERIFIED, FAILED, LATER, HEAVY, WRONG, TRACEBACK)
-GOOD_OUTCOMES = (VERIFIED, TOO_WIDE, REFUSED)
+BUSY = "calibrated and verified, run missed frames"
+OUTCOMES = (VERIFIED, BUSY, TOO_WIDE, REFUSED, NOT_VERIFIED, FAILED, LATER, HEAVY, WRONG, TRACEBACK)
+GOOD_OUTCOMES = (VERIFIED, BUSY, TOO_WIDE, REFUSED)
+# Refused by the first image, before anything is measured.
+BLACK_TOO_BRIGHT = "a black screen fills the tracker"
+# What `assess` says of a run of 20 s on a machine that is too busy to keep its rate.
+TOO_FEW_ANSWERS = ("missed so many frames", "valid answers, and")
 WIDE_STAR = "star_sigma_ratio"
 FIRST_LIGHT, VERIFY, CERTIFY, SERVE, SEND, TRACKER, ASSESS = COMMANDS = (
     "first-light",
@@ -336,6 +341,12 @@ def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
         return _without_steps(session)
     reasons = _reasons(results)
     failed = next((step for step in steps.values() if step["verdict"] == "failed"), None)
+    if (
+        failed is not None
+        and failed["name"] == "orientation"
+        and BLACK_TOO_BRIGHT in failed["line"]
+    ):
+        return REFUSED, failed["line"]
     if failed is not None and not (failed["name"] == "verify" and only_wide(reasons)):
         return FAILED, f"{failed['name']}: {failed['line']}"
     verdict = results.get(VERIFY)
@@ -363,10 +374,19 @@ def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     well.
     """
     later = [name for name in COMMANDS[2:] if name in results and results[name].code]
+    reasons = _reasons(results)
+    if later == [ASSESS] and _is_short_of_frames(results):
+        return (TOO_WIDE, reasons[0]) if reasons else (BUSY, results[ASSESS].last_line)
     if later:
         return LATER, "; ".join(f"{name}: {results[name].last_line}" for name in later)
-    reasons = _reasons(results)
     return (TOO_WIDE, reasons[0]) if reasons else None
+
+
+def _is_short_of_frames(results: Mapping[str, CommandResult]) -> bool:
+    """Whether `assess` has too few answers because the run missed frames."""
+    missed = results[SERVE].found.get("missed_frames", 0)
+    told = results[ASSESS].last_line
+    return bool(missed) and any(words in told for words in TOO_FEW_ANSWERS)
 
 
 def _reasons(results: Mapping[str, CommandResult]) -> list[str]:
@@ -437,7 +457,7 @@ def _live(results: Mapping[str, CommandResult]) -> dict[str, Any]:
     bias = assessed.get("bias_arcsec")
     return {
         "serve_frames": served.get("frames"),
-        "serve_missed": served.get("missed"),
+        "serve_missed": served.get("missed_frames"),
         "tracker_answers": answered.get("answers"),
         "assess_bias_arcsec": None if bias is None else " ".join(f"{each:.3g}" for each in bias),
         "assess_availability": assessed.get("availability"),

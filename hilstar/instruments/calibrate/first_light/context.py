@@ -396,13 +396,18 @@ class StepContext:
 
     def looked(self, path: Path, dark: FloatArray) -> DarkSubtracted:
         """An image of the tracker above its dark frame. Raises InputError for one that cannot be
-        read.
+        read, or whose dark frame is saturated.
         """
+        floor_dn = float(np.median(dark))
+        if floor_dn > MAX_FILL * self.full_dn:
+            raise InputError(
+                f"a black screen fills the tracker to {floor_dn / self.full_dn:.0%} of its range in"
+                f" {self.exposure_s:g} s: expose shorter, and write [tracker] exposure_s so; look"
+                " at the monitor's black level, and at other light"
+            )
         pixels, cold = self.pixels(path), dark < HOT_FILL * self.full_dn
         seen = software_image(pixels, self.file.config.tracker.detector)
-        return DarkSubtracted(
-            path, seen - dark, float(pixels[cold].max(initial=0.0)), float(np.median(dark))
-        )
+        return DarkSubtracted(path, seen - dark, float(pixels[cold].max(initial=0.0)), floor_dn)
 
     def read(self, path: Path) -> FloatArray:
         """An image of the tracker (h, w), DN, of a mosaic its superpixels."""

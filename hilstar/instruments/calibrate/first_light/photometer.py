@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import write_whole
 from hilstar.instruments.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
@@ -31,6 +31,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, P
 from hilstar.instruments.calibrate.measurements import COMMON
 from hilstar.instruments.calibrate.plan import Patch, in_channel
 from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.server.bench.build import bench_calibration
 from hilstar.tracker.rounding import (
     STEP_PHASES,
     before_adc_dn,
@@ -63,7 +64,8 @@ class DotField:
     """A square of the monitor (left, top, side; px) and the part of the tracker's image with its
     light (slices).
 
-    `monitor_px` is the number of monitor pixels seen in that part.
+    `monitor_px` is the number of monitor pixels seen in that part, each by its light relative to
+    that of the square's.
     """
 
     left: int
@@ -93,9 +95,11 @@ class DotField:
         return (self.side // period) ** 2
 
 
-def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple[int, ...]]:
+def field_for(
+    geometry: BenchGeometry, sigma_px: float, even: Float32Array | None = None
+) -> tuple[DotField, tuple[int, ...]]:
     """The square for lattices, and their periods from dense to sparse; `sigma_px` is the tracker's
-    PSF.
+    PSF, `even` (h, w) the screen's relative light.
 
     Raises InputError where too little of the monitor is seen.
     """
@@ -125,10 +129,11 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
     margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
     rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
     periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
-    return (
-        DotField(left, top, cells * sparsest, rows, columns, monitor_area(geometry, rows, columns)),
-        periods,
-    )
+    square_px = cells * sparsest
+    area_px = monitor_area(geometry, rows, columns, even)
+    if even is not None:
+        area_px /= float(even[top : top + square_px, left : left + square_px].mean())
+    return DotField(left, top, square_px, rows, columns, area_px), periods
 
 
 def _seen(
@@ -154,9 +159,11 @@ def _seen(
     return ends[1], ends[0]
 
 
-def monitor_area(geometry: BenchGeometry, rows: slice, columns: slice) -> float:
+def monitor_area(
+    geometry: BenchGeometry, rows: slice, columns: slice, even: Float32Array | None = None
+) -> float:
     """The number of monitor pixels that a part of the tracker's image sees, those beyond the
-    screen's edge not counted.
+    screen's edge not counted; each counts by `even` (h, w) where that is known.
 
     Each tracker pixel is a quadrangle on the monitor. A tilted screen and a wide field make them
     differ by several percent.
@@ -174,7 +181,13 @@ def monitor_area(geometry: BenchGeometry, rows: slice, columns: slice) -> float:
     middle_y = (corner_y[1:, 1:] + corner_y[:-1, :-1]) / 2
     on_screen = np.abs(middle_x - (width - 1) / 2) <= width / 2
     on_screen &= np.abs(middle_y - (height - 1) / 2) <= height / 2
-    return float(area[on_screen].sum())
+    area = area[on_screen]
+    if even is not None:
+        # A black screen glows over the whole part, whose edges are darker than the dots' square.
+        row = np.clip(np.rint(middle_y[on_screen]), 0, height - 1).astype(np.intp)
+        column = np.clip(np.rint(middle_x[on_screen]), 0, width - 1).astype(np.intp)
+        area = area * even[row, column]
+    return float(area.sum())
 
 
 def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
@@ -416,7 +429,10 @@ class Photometer:
         geometry = context.real_geometry()
         self.context, self.assumed = context, assumed
         self.pairs, self.longest_s = pairs, longest_s
-        self.field, self.periods = field_for(geometry, sigma_px)
+        light_map = bench_calibration(context.file.config, context.file.folder)
+        even = light_map.uniformity_map(context.resolution_px)
+        self._even_relative = light_map.uniformity_relative or 0.0
+        self.field, self.periods = field_for(geometry, sigma_px, even)
         self.ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
         self.shares = peak_shares(self.periods, self.ratio, sigma_px)
         self.profiles: dict[int, FloatArray] = {}
@@ -799,6 +815,8 @@ class Photometer:
         for image_dn2 in (glowing_dn2, dark_dn2):
             rounding_dn = rounding_rms(before_adc_dn(image_dn2 / self.field.tracker_px))
             variance += (self.field.tracker_px * rounding_dn) ** 2
+        # The glow is over more of the screen than the dots are, by a map that has its error.
+        variance += (self._even_relative * more) ** 2
         return light + max(more / seconds, 0.0), math.sqrt(variance) / seconds
 
     def _look(self, name: str, at: Range, patch: Patch) -> Look:

@@ -24,7 +24,7 @@ from hilstar.basics.rotation import from_matrix, to_matrix
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
 from hilstar.display.quantise import shown_light
 from hilstar.display.response import Levels
-from hilstar.instruments.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
+from hilstar.instruments.calibrate.first_light.context import MAX_FILL, StepContext
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern
 from hilstar.instruments.calibrate.scale import STAR_MAG
 from hilstar.server.bench.build import open_bench
@@ -51,6 +51,7 @@ LOST_MARGIN = 3.0
 MOST = 0.5  # a share of the variance this large is named as its cause
 FAR = 3.0  # times their errors: more scatter than this has another cause
 ONE_SIDED = 1.645  # sigmas of 95 %
+NOISE_POINTS = 200  # of a star's noise by its light, from 1 DN on
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,15 @@ class StarSpot:
         variance += (self.prnu * light) ** 2 * float((shares**2).sum())
         variance += (self.rounded_dn(light, noise_dn) ** 2).mean(axis=1)
         return np.asarray(MAG_PER_RELATIVE * np.sqrt(variance) / (light * self.window_share))
+
+    def tabled_noise_mag(self, dn: FloatArray, noise_dn: float, largest_dn: float) -> FloatArray:
+        """`light_noise_mag` (n,) from a table: the rounding of each of 100 000 stars takes minutes.
+
+        Stars of less than 1 DN are infinitely noisy, those over `largest_dn` have its noise.
+        """
+        points_dn = np.geomspace(1.0, max(largest_dn, 2.0), NOISE_POINTS)
+        noise_mag = self.light_noise_mag(points_dn, noise_dn)
+        return np.interp(dn, points_dn, noise_mag, left=np.inf)
 
     def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
         """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
@@ -345,8 +355,8 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
             f"stars_{number:03}",
             *(f"stars_{number:03}_{again:02}" for again in range(1, frames)),
         ]
-        looked = [context.look(Pattern(name, codes[0], codes[1:]), dark) for name in names]
-        fields.append(_compared(context, looked, wanted, spot))
+        patterns = [Pattern(name, codes[0], codes[1:]) for name in names]
+        fields.append(_compared(context, patterns, dark, wanted, spot))
     arrays = [
         field.name
         for field in dataclasses.fields(StarsSeen)
@@ -388,7 +398,11 @@ def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
 def _mean_dark(context: StepContext, frames: int) -> tuple[FloatArray, tuple[Path, ...]]:
     """The mean of `frames` images of a black screen (h, w), and their files."""
     paths = [context.dark(number) for number in range(frames)]
-    return np.asarray(np.mean([context.read(path) for path in paths], axis=0)), tuple(paths)
+    # One image at a time: twenty of 2048 x 2048 pixels take 0.7 GB.
+    total = context.read(paths[0])
+    for path in paths[1:]:
+        total = total + context.read(path)
+    return total / frames, tuple(paths)
 
 
 def _fields(
@@ -400,9 +414,10 @@ def _fields(
     stars, rng = bench.stars, np.random.default_rng(SEED)
     per_e = context.exposure_s / spot.gain_e_per_dn
     dn = stars.electrons_per_s * per_e
-    readable = (stars.row >= 0) & (spot.light_noise_mag(dn, noise_dn) < READ_MAG)
+    largest_dn = MAX_FILL * context.full_dn / spot.peak_share
+    readable = (stars.row >= 0) & (dn < largest_dn)
     readable &= stars.electrons_per_s * bench.psf.peak_share <= bench.flux_at_white_e_per_s
-    readable &= dn * spot.peak_share < MAX_FILL * context.full_dn
+    readable &= spot.tabled_noise_mag(dn, noise_dn, largest_dn) < READ_MAG
     attitudes = [np.asarray(q / np.linalg.norm(q)) for q in rng.normal(size=(RANDOM_ATTITUDES, 4))]
     which = np.flatnonzero(readable)
     brightest = which[np.argsort(-dn[which], kind="stable")][:POINTED_ATTITUDES]
@@ -495,11 +510,22 @@ def _codes_mag(
 
 
 def _compared(
-    context: StepContext, looked: list[DarkSubtracted], wanted: ExpectedStars, spot: StarSpot
+    context: StepContext,
+    patterns: list[Pattern],
+    dark: FloatArray,
+    wanted: ExpectedStars,
+    spot: StarSpot,
 ) -> StarsSeen:
     """The stars found in the mean of a field's images, against those that should be there."""
-    image = np.asarray(np.mean([each.image for each in looked], axis=0))
-    background = noisiest_background(image, 1 / len(looked))
+    first = context.look(patterns[0], dark)
+    paths, total = [first.path], first.image
+    for pattern in patterns[1:]:
+        looked = context.look(pattern, dark)
+        paths.append(looked.path)
+        total = total + looked.image
+    images = len(paths)
+    image = total / images
+    background = noisiest_background(image, 1 / images)
     found, noise_dn = find_stars(image, spot.settings, background), background.noise
     seen = np.stack([found.x_px, found.y_px], axis=1)
     count = len(wanted.e_per_s)
@@ -519,11 +545,11 @@ def _compared(
     peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
     chosen = nearest[matched]
     dn = found.flux[chosen] / spot.window_share
-    shared = dataclasses.replace(spot, frames=len(looked))
+    shared = dataclasses.replace(spot, frames=images)
     noise_mag = shared.light_noise_mag(dn, noise_dn)
     whole_dn = np.maximum(dn * spot.window_share, 1e-9)
     rounded = shared.rounded_dn(dn, noise_dn) / whole_dn[:, None]
-    saturated = found.peak[chosen] > MAX_FILL * context.full_dn - looked[0].floor_dn
+    saturated = found.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
     return StarsSeen(
         hip=wanted.hip[matched],
         place_px=wanted.place_px[matched],
@@ -536,6 +562,6 @@ def _compared(
         screen=wanted.screen[matched],
         codes_mag=wanted.codes_mag[matched],
         lost=int((~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)).sum()),
-        frames=len(looked),
-        images=tuple(each.path for each in looked),
+        frames=images,
+        images=tuple(paths),
     )

@@ -5,19 +5,22 @@ rounding and black.
 from __future__ import annotations
 
 import math
+from contextlib import closing
 
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.display.calibration import (
     CalibrationHead,
     NotesTable,
+    add_uniformity,
     load_calibration,
     read_toml,
     write_calibration,
 )
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.response import gamma_response
+from hilstar.display.response import gamma_response, srgb_response
 from hilstar.instruments.calibrate.first_light.context import StepContext
 from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
 from hilstar.instruments.calibrate.first_light.photometer import monitor_area
@@ -33,6 +36,9 @@ from tests.support.benches import TWIN, bench_text
 pytestmark = pytest.mark.usefixtures("without_charts")
 BITS, BLACK, POWER = 8, 1e-3, 2.35
 DECADES = (1e-1, 1e-2, 1e-3)
+BRIGHT_BLACK = 0.01  # its noise is about 0.1 % of it
+EDGE_FALL = 0.4  # of light from the middle of the screen to its corners
+EVEN_ERROR = 0.001  # of the map of it, relative
 SURE = 4.0  # sigmas: one figure in 16 000 is further off
 # Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
 # three times.
@@ -48,9 +54,9 @@ NOISY = {
 SILENT = {"gain_e_per_dn": 24.0, "read_noise_e": 0.0, "dark_e_per_s": 0.0, "offset_dn": 40.0}
 
 
-def planted(folder, detector, collimator_mm=120):
+def planted(folder, detector, collimator_mm=120, black=BLACK):
     """A bench file that supposes sRGB, and its truth: a power law with a black level."""
-    light = gamma_response(BITS, POWER).light + BLACK
+    light = gamma_response(BITS, POWER).light + black
     head = CalibrationHead(
         "photometric", "planted", "2026-11-28", "none", "relative", BITS, "true-response.csv"
     )
@@ -65,7 +71,7 @@ def planted(folder, detector, collimator_mm=120):
     (folder / "truth.toml").write_text(bench_text(TWIN, true))
 
 
-def measured(folder, seed, sets_exposure=True):
+def measured(folder, seed, sets_exposure=True, black=BLACK):
     """What the step comes to on the planted bench, and its figures in sigmas: the response by
     decades, and black.
     """
@@ -86,8 +92,8 @@ def measured(folder, seed, sets_exposure=True):
         code = int(np.argmin(np.abs(light - decade)))
         error = float(outcome.figures[f"error_at_1e-{round(-math.log10(decade))}_percent"]) / 100
         off.append((response.light[code] / light[code] - 1) / error)
-    black = (response.black - BLACK) / read_toml(folder / "response.toml").errors.black
-    return outcome, np.array(off), black
+    off_black = (response.black - black) / read_toml(folder / "response.toml").errors.black
+    return outcome, np.array(off), off_black
 
 
 @pytest.mark.parametrize("detector", [NOISY, SILENT], ids=["noisy", "silent"])
@@ -104,6 +110,45 @@ def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detec
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS
     assert np.abs(off).max() < SURE
     assert np.abs(black).max() < SURE
+
+
+def test_the_glow_of_a_screen_that_is_darker_at_its_edges_is_counted_by_its_light(tmp_path):
+    """A black screen glows beyond the dots' square, where less light comes from: black was 0.5 %
+    too low, 7 of its errors.
+    """
+    planted(tmp_path, NOISY, black=BRIGHT_BLACK)
+    y, x = ((np.arange(count) + 0.5) / count * 2 - 1 for count in (9, 16))
+    grid = 1 - EDGE_FALL * (x[None] ** 2 + y[:, None] ** 2) / 2
+    add_uniformity(tmp_path / "true-light.toml", grid)
+    head = CalibrationHead(
+        "photometric", "planted", "2026-11-28", "none", "relative", BITS, "known.csv"
+    )
+    write_calibration(
+        tmp_path / "known.toml", head, {"w": srgb_response(BITS).light}, 0.0, NotesTable()
+    )
+    add_uniformity(tmp_path / "known.toml", grid, EVEN_ERROR)
+    bench = tmp_path / "bench.toml"
+    tables = {"monitor": {"bits": BITS, "calibration": "known.toml"}, "tracker.detector": NOISY}
+    tables["collimator"] = {"focal_length_mm": 120}
+    bench.write_text(bench_text(TWIN, tables))
+    _, off, black = measured(tmp_path, 0, black=BRIGHT_BLACK)
+    assert np.abs(off).max() < SURE
+    assert abs(black) < SURE
+    error = read_toml(tmp_path / "response.toml").errors.black
+    assert error > EVEN_ERROR * BRIGHT_BLACK  # the map's error is part of it
+    assert error < 2 * EVEN_ERROR * BRIGHT_BLACK
+
+
+def test_a_black_screen_that_saturates_the_tracker_is_named(tmp_path):
+    """It was told as squares that are not in the image, and to expose longer."""
+    planted(tmp_path, NOISY)
+    file, true = (read_bench_file(tmp_path / name) for name in ("bench.toml", "truth.toml"))
+    with closing(VirtualBench(file, true, 0)) as source:
+        context = StepContext(file, tmp_path, tmp_path / "images", source, {}, {}, 96)
+        dark = context.dark()
+        full = np.full_like(context.read(dark), context.full_dn)
+        with pytest.raises(InputError, match="black screen fills the tracker to 100%"):
+            context.looked(dark, full)
 
 
 def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tmp_path):

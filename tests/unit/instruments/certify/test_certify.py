@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -14,11 +15,14 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from hilstar.instruments.certify.assembly import DOT_IMAGES
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import from_rotation_vector, multiply
+from hilstar.instruments.certify.assembly import DOT_IMAGES, reference_stars
 from hilstar.instruments.certify.budget import Input, by_trials, first_order, why_they_differ
 from hilstar.instruments.certify.check import compare, take_check
 from hilstar.instruments.certify.estimates import light_deviation, place_errors
 from hilstar.instruments.certify.lens import lens_fit
+from hilstar.instruments.certify.model import Figures, true_deviations
 from hilstar.instruments.certify.readings import (
     LightReadings,
     VirtualReader,
@@ -188,6 +192,49 @@ def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:
         assert max(abs(np.array(counted.error)) / np.array(counted.standard)) < 5, where
 
 
+LENS = "true-lens.toml"
+EVEN_PINHOLE = {"fall": 0.0, "k1": 0.0, "k2": 0.0, "tilt_deg": (0.0, 0.0)}
+
+
+def test_a_screen_is_the_same_however_its_mounting_is_stated(tmp_path) -> None:
+    """First light finds flip_y where the truth says flip_x and 180 degrees, and no turn where it
+    says a quarter turn of a screen that hangs by 50 degrees: certify refused both.
+    """
+    turn_arcsec = 20.0
+    one = replace(drawn(np.random.default_rng(7)), **EVEN_PINHOLE, mount_arcsec=(0, 0, turn_arcsec))
+    bench_path, truth_path = plant(tmp_path, one)
+    file, plain = read_bench_file(bench_path), read_bench_file(truth_path)
+    text = truth_path.read_text()
+    flipped_path = tmp_path / "flipped.toml"
+    flips = "flip_x = true\nflip_y = true\nrotate_deg = 180\n"
+    flipped_path.write_text(text.replace("[monitor]\n", f"[monitor]\n{flips}"))
+    quarter = from_rotation_vector(np.array([0.0, 0.0, -math.pi / 2]))
+    hang = from_rotation_vector(np.array([0.0, 0.0, turn_arcsec / ARCSEC]))
+    q = ", ".join(map(repr, multiply(quarter, hang).tolist()))
+    lens = re.sub("q_cam_to_mon = .*", f"q_cam_to_mon = [{q}]", (tmp_path / LENS).read_text())
+    lens = lens.replace("[1920, 1080]", "[1080, 1920]").replace("[959.5, 539.5]", "[539.5, 959.5]")
+    (tmp_path / "turned-lens.toml").write_text(lens)
+    turned_path = tmp_path / "turned.toml"
+    turned = text.replace("[monitor]\n", "[monitor]\nrotate_deg = 90\n").replace(
+        LENS, "turned-lens.toml"
+    )
+    turned_path.write_text(turned.replace("[1920, 1080]", "[1080, 1920]"))
+    wanted = VirtualReader(file, plain, 3).dots(*dot_places(geometry_of(file)), 4)
+    figures = Figures(file, reference_stars(file))
+    wanted_truth = true_deviations(figures, plain)
+    for path in (flipped_path, turned_path):
+        other = read_bench_file(path)
+        found = VirtualReader(file, other, 3).dots(*dot_places(geometry_of(file)), 4)
+        assert found.seen_x_px == pytest.approx(wanted.seen_x_px, abs=1e-6)
+        assert found.seen_y_px == pytest.approx(wanted.seen_y_px, abs=1e-6)
+        truth = true_deviations(figures, other)
+        assert truth.place_arcsec == pytest.approx(wanted_truth.place_arcsec, abs=1e-6)
+    mirrored = tmp_path / "mirrored.toml"
+    mirrored.write_text(text.replace("[monitor]\n", "[monitor]\nflip_x = true\n"))
+    with pytest.raises(InputError, match="mounted otherwise"):
+        VirtualReader(file, read_bench_file(mirrored), 3)
+
+
 def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) -> None:
     """White of a sparse lattice is ten times as noisy as other codes: its interval is its own,
     and theirs are not wider.
@@ -237,6 +284,31 @@ def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) 
     )
     sigma = np.linalg.norm(deviation.factors, axis=1) / deviation.value
     assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
+
+
+def test_a_faint_code_that_reads_below_black_does_not_undo_the_others(tmp_path) -> None:
+    """Its light, and so its noise by its light, was 0, and all scatters became infinite: "white
+    reads no light above black".
+    """
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    )
+    file = read_bench_file(path)
+    lit = [1, 20, 40, 80, 120, 160, 200, 255]
+    codes = np.array([0, *lit, 0, *lit, 0, *lit, 0])
+    rng = np.random.default_rng(4)
+    black = 1e4
+    light = black + grey_response(file).light[codes] * 1e6
+    light += np.where(codes > 0, 1e-4 * (light - black), 1.0) * rng.standard_normal(len(codes))
+    light[codes == 1] = black - np.array([30.0, 31.0, 32.0])
+    shape = np.where(codes == 1, 1e9, 1.0)
+    readings = LightReadings(codes, light, np.zeros(len(codes)), noise_shape=shape)
+    deviation = light_deviation(file, readings)
+    off = deviation.value * WHITE_E_PER_S / 1e6 - 1
+    assert np.abs(off[1:]).max() < 1e-3
+    assert np.isfinite(deviation.factors).all()
+    assert deviation.noise == pytest.approx(1e-4, rel=0.5)
 
 
 def test_three_readings_hold_the_truth_by_their_t() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,7 @@ NINE_FOR_A_SQUARE = 2e-4
 # pixel.
 INVERSE_PX = 1e-7
 MARGIN_PX = 6.0
+MAX_PEAK = 5.0  # memory over that of one coordinate: two results and a block of a dozen arrays
 
 
 @pytest.fixture
@@ -110,6 +112,21 @@ def test_a_monitor_pixel_is_seen_where_its_direction_is_whatever_the_lenses_do(g
     assert np.allclose(seen, tracker.project(direction @ tracker.cam_to_image.T), atol=INVERSE_PX)
     assert np.abs(np.array(seen) - geometry.to_tracker(*shown)).max() > 100 * INVERSE_PX
     assert np.allclose(bent.to_monitor(*seen), shown, atol=INVERSE_PX)
+
+
+def test_the_places_of_a_large_detector_are_found_in_blocks(geometry, monkeypatch):
+    """All pixels of 2048 x 2048 at once took 0.5 GB of intermediate values, and a session 2.6."""
+    monkeypatch.setattr(twin_optics, "PIXELS_AT_ONCE", 10_000)
+    y_px, x_px = np.mgrid[0:300, 0:400].reshape(2, -1).astype(np.float64)
+    tracemalloc.start()
+    try:
+        found = geometry.to_monitor(x_px, y_px)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # The two results, and the intermediate values of one block in twelve.
+    assert peak_bytes < MAX_PEAK * x_px.nbytes
+    assert np.array_equal(found, geometry._to_monitor(x_px, y_px), equal_nan=True)
 
 
 @pytest.mark.parametrize("mirror", ["none", "x", "y", "swap"])

@@ -28,10 +28,12 @@ from hilstar.attitude.logs.log_formats import (
 )
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Event, Refusal, decode
+from hilstar.basics.errors import shortened
 from hilstar.basics.reading import open_lines
 
 JSON_KEYS = ('"t_ns"', '"q"', '"rate"', '"sequence"', '"discontinuity"')
 VALID_KEY = '"valid"'
+VALIDITY = {"true": True, "1": True, "false": False, "0": False}
 # An array or an object that begins; "[time]" would be a heading of a table.
 ARRAY_BEGINS = re.compile(r"\[(?:\{|\[|\]|$)")
 # A whole string, a brace, or the quote of a string that goes on in the next piece.
@@ -64,9 +66,13 @@ def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterato
         event: Event = _json_fault(text) or decode(text.encode())
         if not isinstance(event, AttitudeSample | Refusal):
             event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
-        if VALID_KEY in text and _says_invalid(text):
-            invalid += 1
-            continue
+        if VALID_KEY in text:
+            validity = _validity(text)
+            if validity is False:
+                invalid += 1
+                continue
+            if isinstance(validity, Refusal):
+                event = validity
         yield LogEntry(where, event)
     if invalid:
         told.append(invalid_notice(invalid, "line"))
@@ -156,12 +162,18 @@ def _json_fault(text: str) -> Refusal | None:
     return None
 
 
-def _says_invalid(text: str) -> bool:
+def _validity(text: str) -> bool | Refusal:
+    """Whether an object says that its attitude is valid. A program may write the word as a
+    string.
+    """
     try:
-        valid = msgspec.json.decode(text, type=dict[str, object]).get("valid")
+        stated = msgspec.json.decode(text, type=dict[str, object]).get("valid", True)
     except msgspec.MsgspecError:
-        return False  # refused by `decode`
-    return valid in (False, 0)
+        return True  # refused by `decode`
+    word = str(stated).lower()
+    if word not in VALIDITY:
+        return Refusal("format", f"valid is {shortened(stated)!r}; write true or false")
+    return VALIDITY[word]
 
 
 def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:

@@ -79,7 +79,19 @@ def test_zeros_and_rows_marked_invalid_are_left_out_of_an_array(path: Path) -> N
     assert {kind for kind, _ in log.told} >= {"log-start", "log-valid"}
 
 
+@pytest.mark.parametrize("valid", [False, 0, "false", "False", "0"])
+def test_an_attitude_is_left_out_however_its_program_writes_false(
+    path: Path, valid: object
+) -> None:
+    path.write_text(lines([{**ROWS[0], "valid": True}, {**ROWS[1], "valid": valid}, ROWS[2]]))
+    log = open_log(path)
+    assert [sample.t_ns for sample in log.samples] == [ROWS[0]["t_ns"], ROWS[2]["t_ns"]]
+    assert dict(log.told)["log-valid"].startswith("1 line is marked as not valid")
+
+
 REFUSED = {
+    lines([{**ROWS[0], "valid": "maybe"}]): ":1: valid is 'maybe'; write true or false",
+    lines([{**ROWS[0], "valid": None}]): ":1: valid is ",
     json.dumps([*ROWS, NOT_UNIT]): ":1, object 5: the quaternion's norm is 1.41421",
     json.dumps([*ROWS, NOT_UNIT], indent=0): ", object 5: the quaternion's norm is 1.41421",
     json.dumps(ROWS)[:-20]: ":1, object 4: ",

@@ -181,13 +181,15 @@ def refuse_kind(path: Path, head: bytes, advice: str) -> None:
 
 
 @contextmanager
-def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[str]]:
+def open_lines(
+    path: Path, advice: str, limit_bytes: int, whole_lines: bool = True
+) -> Iterator[Iterator[str]]:
     """The lines of a text, one after another, so that a large file needs no memory; each ends as in
     the file.
 
     UTF-8, UTF-16 with its mark, and Windows-1252 with a warning: a line that is no UTF-8.
     Raises InputError as `read_text` does, for what is no text, and for a line of more than
-    MAX_LINE_CHARACTERS.
+    MAX_LINE_CHARACTERS: unless `whole_lines`, such a line is given in pieces of that length.
     """
     with open_regular(path, advice, limit_bytes) as file:
         try:
@@ -197,7 +199,7 @@ def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[s
             if encoding == "utf-8-sig":
                 refuse_kind(path, head, advice)
             text = io.TextIOWrapper(file, encoding=encoding, errors="surrogateescape", newline="")
-            yield _bounded(path, text, advice)
+            yield _bounded(path, text, advice, whole_lines)
         except UnicodeDecodeError as error:
             raise cannot_read(
                 path, "it is cut off or damaged: not UTF-16 to its end", advice
@@ -206,11 +208,12 @@ def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[s
             raise cannot_read(path, error, advice) from error
 
 
-def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
+def _bounded(path: Path, text: IO[str], advice: str, whole_lines: bool) -> Iterator[str]:
     number = 0
     while line := text.readline(MAX_LINE_CHARACTERS):
         number += 1
-        if len(line) == MAX_LINE_CHARACTERS and line[-1] not in "\r\n":
+        is_piece = len(line) == MAX_LINE_CHARACTERS and line[-1] not in "\r\n"
+        if is_piece and whole_lines:
             raise InputError(
                 f"{path}:{number}: the line has {MAX_LINE_CHARACTERS} characters or more; {advice}"
             )

@@ -85,7 +85,7 @@ NO_IDENTIFIER = (
     "no identifier of their own (blank, repeated, or a floating-point number: its 15 digits hold no"
     " source_id); all are named by their rows"
 )
-VERSION = 3  # version of the cached result: count up whenever it changes
+VERSION = 4  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
 HASH_BYTES = 1 << 22
 MAX_STORED_BYTES = 3_000_000_000
@@ -152,10 +152,14 @@ def assemble(
     if _repeats(identifier[kept]):
         columns.notices.append(f"{_repeats(identifier[kept])} of its stars have {NO_IDENTIFIER}")
         designation, identifier = columns.row_numbers()
+    hip = columns.hip()
+    repeated = _repeated_hip(hip, kept)
+    if repeated:
+        columns.notices.append(repeated)
     figures |= {
         "epoch_jyear": epoch,
         "identifier": identifier,
-        "hip": _once(columns.hip(), kept, v_mag),
+        "hip": _once(hip, kept, v_mag),
     }
     catalog = plain_catalog(
         designation, len(kept), {name: values[kept] for name, values in figures.items()}
@@ -414,6 +418,21 @@ def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:
 def _reasons(reason: npt.NDArray[np.int8]) -> str:
     counts = np.bincount(reason, minlength=len(_REASONS))
     return ", ".join(f"{counts[k]} {_REASONS[k]}" for k in range(1, len(_REASONS)) if counts[k])
+
+
+def _repeated_hip(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_]) -> str:
+    """What to tell of HIP numbers that several stars have: which, and who keeps them; "" of
+    none.
+    """
+    numbers, counts = np.unique(hip[kept & (hip > 0)], return_counts=True)
+    several = counts > 1
+    if not several.any():
+        return ""
+    place = int(np.argmax(counts))
+    example = f"HIP {numbers[place]} of {counts[place]}"
+    number = int(several.sum())
+    what = "1 HIP number is" if number == 1 else f"{number} HIP numbers are"
+    return f"{what} of several stars each ({example}); the brightest keeps it, the others have none"
 
 
 def _once(

@@ -6,7 +6,8 @@ CNES's tools: "days (MJD), sec (UTC), q0 (real part), q1, q2, q3"):
 2. A time is two columns, the modified Julian day (from 1858-11-17) and the seconds of that day, on
    TIME_SYSTEM. An epoch in one column, as the CCSDS has it, is taken too.
 3. The real part of a quaternion comes first. Some writers state QUATERNION_TYPE = LAST and put it
-   first all the same, others put it last: such a file is refused unless a comment names q0.
+   first all the same, others put it last: such a file is read as a comment of its metadata names
+   the order ("q1, q2, q3, q0 (real part)"), and is refused without one.
 4. The quaternion is the AEM's: with A2B, its axis and angle turn the axes of REF_FRAME_A onto those
    of REF_FRAME_B, so hilstar's is its conjugate.
 """
@@ -42,7 +43,12 @@ DAYS = range(36_115, 88_070)
 DAY_SECONDS = 86_401  # with a leap second
 FORM = "write the modified Julian day, its seconds and the quaternion, the real part first"
 UNNAMED_BODY = "UNDEFINED"  # what writers have in place of the spacecraft's frame
+# The order of the columns, as a comment names it.
 REAL_FIRST = re.compile(r"\bq0\b.*\bq1\b", re.IGNORECASE)
+REAL_LAST = re.compile(r"\bq1\b.*\bq2\b.*\bq3\b.*\b(?:q0|q4|qc|qs|qw)\b", re.IGNORECASE)
+FIRST, LAST = "FIRST", "LAST"
+LAST_TO_FRONT = [3, 0, 1, 2]
+NAMED_FIRST, NAMED_LAST = "COMMENT q0 (real part), q1, q2, q3", "COMMENT q1, q2, q3, q0 (real part)"
 
 
 @dataclass(slots=True)
@@ -54,7 +60,8 @@ class _CicSegment:
     where: list[str] = field(default_factory=list)
     epochs: list[str] = field(default_factory=list)
     rows: list[list[float]] = field(default_factory=list)
-    names_real_part: bool = False
+    # Where a comment has the real part: FIRST or LAST.
+    named_order: str = ""
 
 
 @contextlib.contextmanager
@@ -97,8 +104,12 @@ class _CicReading:
             _add_row(self.segments[-1], where, line.split())
 
     def _comment(self, line: str) -> None:
-        if self.segments and REAL_FIRST.search(line):
-            self.segments[-1].names_real_part = True
+        if not self.segments:
+            return
+        if REAL_FIRST.search(line):
+            self.segments[-1].named_order = FIRST
+        elif REAL_LAST.search(line):
+            self.segments[-1].named_order = LAST
 
     def _marker(self, where: str, line: str) -> None:
         begins = line == "META_START"
@@ -194,20 +205,37 @@ def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
         raise AemFaultError(end, f"{detail}; write {ccsds.QUATERNION}")
     if not segment.rows:
         raise AemFaultError(end, "the segment contains no attitude")
-    if meta.get("QUATERNION_TYPE", "FIRST") != "FIRST" and not segment.names_real_part:
-        raise AemFaultError(
-            segment.lines["QUATERNION_TYPE"],
-            f"QUATERNION_TYPE = {meta['QUATERNION_TYPE'][:40]}, where CIC has the real part"
-            " first and writers differ;"
-            " put the real part first, and write QUATERNION_TYPE = FIRST",
-        )
+    order = _order(segment)
     for key in ("REF_FRAME_A", "REF_FRAME_B"):
         if meta[key] == UNNAMED_BODY:
             meta[key] = "SC_BODY"
             told.append(("log-frame", f"{key} = {UNNAMED_BODY} is taken as the spacecraft's body"))
-    meta |= {ccsds.VERSION_KEY: "1.0", "QUATERNION_TYPE": "FIRST"}
+    meta |= {ccsds.VERSION_KEY: "1.0", "QUATERNION_TYPE": FIRST}
     values = np.array(segment.rows, dtype=np.float64)
+    if order == LAST:
+        values = values[:, LAST_TO_FRONT]
+        told.append(("log-order-of-q", "the real part is the last of four, as its comment says"))
     return ccsds.Block(meta, segment.where, segment.epochs, values)
+
+
+def _order(segment: _CicSegment) -> str:
+    """Where the real part is: FIRST or LAST. Raises AemFaultError where that is open."""
+    stated, named = segment.meta.get("QUATERNION_TYPE", ""), segment.named_order
+    if stated in ("", FIRST) and named != LAST:
+        return FIRST
+    where = segment.lines.get("QUATERNION_TYPE", "")
+    if stated not in ("", FIRST, LAST):
+        raise AemFaultError(where, f"QUATERNION_TYPE = {stated[:40]}; write FIRST or LAST")
+    if stated == FIRST:
+        detail = "QUATERNION_TYPE = FIRST, and a comment has the real part last"
+        raise AemFaultError(where, f"{detail}; leave the one that is wrong out")
+    if not named:
+        raise AemFaultError(
+            where,
+            "QUATERNION_TYPE = LAST, where CIC has the real part first and writers differ; add"
+            f" what its columns are: {NAMED_LAST}, or {NAMED_FIRST}",
+        )
+    return named
 
 
 def _begins(beginning: LogHead) -> bool:

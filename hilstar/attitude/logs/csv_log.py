@@ -57,7 +57,6 @@ MARKS = frozenset(
 )
 MORE_ADVICE = ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
 UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"
-JSON_ADVICE = "write JSON lines, on each an object of t_ns and q (jq -c '.[]' FILE)"
 TABLE_KIND, VALID_KIND, CUT_KIND = "log-table", "log-valid", "log-cut"
 
 
@@ -90,7 +89,6 @@ class CsvLog:
         self.told: list[tuple[str, str]] = []
         if not table.columns:
             return
-        self._refuse_json()
         table.advice = f"write finite numbers for {','.join(CSV_COLUMNS)}"
         has_rates = any(table.chosen(name, RATE_UNIT) for name in RATE_COLUMNS)
         table.notices.clear()
@@ -127,11 +125,6 @@ class CsvLog:
             named = ", ".join(marks)
             rows = f"column {named} is not used: rows of every value of it are shown"
             self.told.append((TABLE_KIND, f"{rows}; name it valid, 1 or 0"))
-
-    def _refuse_json(self) -> None:
-        if self.table.columns[0].header.startswith(("[", "{")):
-            what = "is a JSON array, or an object over several lines"
-            raise InputError(f"{self.table.path}: {what}; {JSON_ADVICE}")
 
     def entries(self) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
         """Each attitude, or why it is refused, with its place in the file (":12"), in its order."""

@@ -1,73 +1,179 @@
-"""Logs of JSON lines: each is the wire's JSON form of an attitude."""
+"""Logs of JSON: each object is the wire's JSON form of an attitude.
+
+The objects stand one a line (JSON lines), over several lines, or in one array, as Python's
+`json.dump` of a list writes it: all on one line, however long.
+"""
 
 import contextlib
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
 import msgspec
 
-from hilstar.attitude.logs.csv_log import invalid_notice
-from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated
-from hilstar.attitude.logs.log_formats import MAX_LOG_BYTES, LogFormat, Writing, readable
+from hilstar.attitude.logs.csv_log import CUT_KIND, invalid_notice
+from hilstar.attitude.logs.entries import (
+    MAX_QUOTED_CHARACTERS,
+    LogEntry,
+    LogReading,
+    Stated,
+)
+from hilstar.attitude.logs.log_formats import (
+    MAX_LOG_BYTES,
+    LogFormat,
+    LogHead,
+    Writing,
+    readable,
+)
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Event, Refusal, decode
+from hilstar.basics.errors import shortened
 from hilstar.basics.reading import open_lines
 
 JSON_KEYS = ('"t_ns"', '"q"', '"rate"', '"sequence"', '"discontinuity"')
 VALID_KEY = '"valid"'
+VALIDITY = {"true": True, "1": True, "false": False, "0": False}
+# An array or an object that begins; "[time]" would be a heading of a table.
+ARRAY_BEGINS = re.compile(r"\[(?:\{|\[|\]|$)")
+# A whole string, a brace, or the quote of a string that goes on in the next piece.
+TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[{}"]')
+# What may stand between objects.
+BETWEEN = re.compile(r"[\s,\[\]]*")
+MAX_OBJECT_CHARACTERS = 10_000
+ADVICE = f"write JSON lines, or an array, of objects {JSON_FORM}"
+NO_END = "the array has no ] at its end, as of a file that was cut off; what it has is read"
 
 
 @contextlib.contextmanager
-def read_json_lines(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """The reading of JSON lines. Raises InputError."""
-    with open_lines(path, readable(), MAX_LOG_BYTES) as lines:
+def read_json(path: Path, stated: Stated) -> Iterator[LogReading]:
+    """The reading of JSON. Raises InputError."""
+    with open_lines(path, readable(), MAX_LOG_BYTES, whole_lines=False) as pieces:
         told: list[tuple[str, str]] = []
-        reading = of_packets(path, _read_json_lines(lines, told), "JSON lines", stated)
+        reading = of_packets(path, _read_objects(pieces, told), "JSON lines", stated)
         yield reading
-        # Complete when the last line is read.
+        # Complete when the last object is read.
         reading.told.extend(told)
 
 
-def _read_json_lines(lines: Iterable[str], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
-    """The attitudes of JSON lines; at their end `told` gets a notice of those that say `"valid":
-    false`.
+def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
+    """The attitudes of JSON; at their end `told` gets a notice of those that say `"valid":
+    false`, and of an array without an end.
     """
     invalid = 0
-    for number, line in enumerate(lines, start=1):
-        text = line.strip()
-        if not text:
-            continue
+    objects = JsonObjects()
+    for where, text in objects.split(pieces):
         event: Event = _json_fault(text) or decode(text.encode())
         if not isinstance(event, AttitudeSample | Refusal):
             event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
-        if VALID_KEY in text and _says_invalid(text):
-            invalid += 1
-            continue
-        yield LogEntry(f":{number}", event)
+        if VALID_KEY in text:
+            validity = _validity(text)
+            if validity is False:
+                invalid += 1
+                continue
+            if isinstance(validity, Refusal):
+                event = validity
+        yield LogEntry(where, event)
     if invalid:
         told.append(invalid_notice(invalid, "line"))
+    if objects.depth > 0:
+        told.append((CUT_KIND, NO_END))
+
+
+class JsonObjects:
+    """Splits JSON into the texts of its objects; `depth` is that of the arrays around them."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self._count = 0
+        # The line of what is read, and the one on which what waits began.
+        self._line = 1
+        self._first_line = 1
+
+    def split(self, pieces: Iterable[str]) -> Iterator[tuple[str, str]]:
+        """Each object with its place (":12"), and what else stands between objects, as it is."""
+        waiting = ""
+        for piece in pieces:
+            ends_line = piece.endswith(("\n", "\r"))
+            text = waiting + piece
+            place = self._next_object(text, 0)
+            while end := _end_of_object(text, place, ends_line):
+                yield self._where(), text[place:end].strip()
+                place = self._next_object(text, end)
+            waiting = text[place:]
+            if len(waiting) > MAX_OBJECT_CHARACTERS:
+                break
+            self._line += ends_line
+            if not waiting:
+                self._first_line = self._line
+        if waiting:
+            yield self._where(), waiting.strip()
+
+    def _next_object(self, text: str, place: int) -> int:
+        """The place of what follows the commas, blanks and brackets from a place on."""
+        between = BETWEEN.match(text, place)
+        assert between is not None
+        end = between.end()
+        self.depth += text.count("[", place, end) - text.count("]", place, end)
+        if end > place:
+            self._first_line = self._line
+        return end
+
+    def _where(self) -> str:
+        self._count += 1
+        # All of an array may stand on one line.
+        return f":{self._first_line}" + (f", object {self._count}" if self.depth > 0 else "")
+
+
+def _end_of_object(text: str, place: int, ends_line: bool) -> int:
+    """Where the object at a place ends, or the line of what is none; 0 where that is to come."""
+    if not text.startswith("{", place):
+        has_line = ends_line and place < len(text)
+        return len(text) if has_line else 0
+    depth = 0
+    for token in TOKEN.finditer(text, place):
+        if token[0] == '"':
+            return 0
+        if token[0] == "{":
+            depth += 1
+        elif token[0] == "}":
+            depth -= 1
+        if depth == 0:
+            return token.end()
+    return 0
 
 
 def _json_fault(text: str) -> Refusal | None:
-    """What msgspec would not say of a line: an object over several lines, a key twice (it takes the
-    last).
+    """What msgspec would not say of an object: that it is none, or too long to be an attitude, or
+    has a key twice (it takes the last).
     """
-    if text in ("{", "["):
-        several = "a JSON object over several lines; write each on one line (jq -c . FILE)"
-        return Refusal("format", several)
+    if not text.startswith("{"):
+        quoted = text[:MAX_QUOTED_CHARACTERS]
+        return Refusal("format", f"{quoted!r} is no JSON object; {ADVICE}")
+    if len(text) > MAX_OBJECT_CHARACTERS:
+        long = f"a JSON object of over {MAX_OBJECT_CHARACTERS} characters, or one without an end"
+        return Refusal("format", f"{long}; {ADVICE}")
     for key in JSON_KEYS:
         if text.count(key) > 1:
-            return Refusal("format", f"key {key} is there twice; write each once")
+            twice = f"key {key} is there twice"
+            if text.count("{") > 1:
+                twice += " (an object without an end, or with others within it)"
+            return Refusal("format", f"{twice}; write each once")
     return None
 
 
-def _says_invalid(text: str) -> bool:
+def _validity(text: str) -> bool | Refusal:
+    """Whether an object says that its attitude is valid. A program may write the word as a
+    string.
+    """
     try:
-        valid = msgspec.json.decode(text, type=dict[str, object]).get("valid")
+        stated = msgspec.json.decode(text, type=dict[str, object]).get("valid", True)
     except msgspec.MsgspecError:
-        return False  # refused by `decode`
-    return valid in (False, 0)
+        return True  # refused by `decode`
+    word = str(stated).lower()
+    if word not in VALIDITY:
+        return Refusal("format", f"valid is {shortened(stated)!r}; write true or false")
+    return VALIDITY[word]
 
 
 def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:
@@ -80,12 +186,17 @@ def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample], writin
         file.write(encoder.encode(form) + b"\n")
 
 
+def _begins(beginning: LogHead) -> bool:
+    word = beginning.word
+    return word.startswith("{") or ARRAY_BEGINS.match(word) is not None
+
+
 log_format = LogFormat(
     "JSON lines",
-    read_json_lines,
+    read_json,
     listed="JSON lines",
     uses=LIKE_PACKETS,
-    begins=lambda log: log.word.startswith("{"),
+    begins=_begins,
     endings=(".jsonl", ".json"),
     write=_write_json_lines,
 )

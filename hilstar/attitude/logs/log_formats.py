@@ -46,7 +46,7 @@ class LogHead(NamedTuple):
     @property
     def word(self) -> str:
         """The first word of a text's first line that is no comment; "" where there is none."""
-        with open_lines(self.path, readable(), MAX_LOG_BYTES) as lines:
+        with open_lines(self.path, readable(), MAX_LOG_BYTES, whole_lines=False) as lines:
             for line in lines:
                 words = line.split(maxsplit=1)
                 if words and words[0] != "COMMENT" and not words[0].startswith("#"):

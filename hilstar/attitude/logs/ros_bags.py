@@ -14,6 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from hilstar.attitude.logs.bag_unpacking import UnpackingError, bound_unpacking, refuse_overlaps
 from hilstar.attitude.logs.log_formats import LogHead
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.files import MCAP_MAGIC, temporary_folder
@@ -129,12 +130,21 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """A .bag, .db3 or .mcap file, or a directory of the latter two. Raises InputError."""
     from rosbags.highlevel import AnyReader
 
+    bound_unpacking()
     with temporary_folder("bag") as place, contextlib.ExitStack() as stack:
         named = _directory(path) if path.is_dir() else _by_its_ending(path, place)
         with _readable(path):
             types = own_types(named.suffix != ".bag")
             reader = stack.enter_context(AnyReader([named], default_typestore=types))
+            _refuse_overlaps(path, reader)
         yield Bag(path, reader)
+
+
+def _refuse_overlaps(path: Path, reader: "AnyReader") -> None:
+    """Refuse (InputError) MCAP files whose chunks of one time are too large together."""
+    for bag in reader.readers:
+        for storage in getattr(bag, "storages", ()):
+            refuse_overlaps(path, getattr(storage, "chunks", ()))
 
 
 def _directory(path: Path) -> Path:
@@ -179,6 +189,8 @@ def _readable(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
+    except UnpackingError as error:
+        raise InputError(f"{path}: {error}") from error
     except Exception as error:  # its readers pass on what struct, sqlite, yaml and others raise
         reason = " ".join(str(error).split()) or type(error).__name__
         said = f"{path}: rosbags cannot read it ({shortened(reason)})"

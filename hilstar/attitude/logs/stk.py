@@ -222,7 +222,8 @@ def _add_row(file: _StkFile, where: str, line: str) -> None:
     count = COUNTS[file.form]
     wanted = f"write a time and {count} numbers for {file.form}"
     words = line.split()
-    time_words = words[: len(words) - count]
+    # None where the row is too short: a negative end would count from the row's own end.
+    time_words = words[: max(len(words) - count, 0)]
     quoted = line[:MAX_QUOTED_CHARACTERS]
     # A date may be several words, and a number of seconds is one.
     is_date = file.value("timeformat", "epsec") in DATES

@@ -28,13 +28,20 @@ from hilstar.basics.errors import InputError, MachineError, one_line
 from hilstar.basics.reading import read_bytes
 from hilstar.optics.camera import Lens
 from hilstar.optics.glass.codev_file import read_codev
-from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription
+from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription, LensSurface
 from hilstar.optics.glass.optiland_lens import optic_of
 from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
 from hilstar.optics.glass.zemax_file import read_zemax
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
 ADVICE = "give a lens file: .zmx of Zemax, .seq of CODE V, or .json of optiland"
+# What optiland raises for mirrors and tilts of which it knows no focal length.
+NO_PARAXIAL_RAYS = "UnsupportedParaxialGeometryError"
+TILTED = (
+    "it is turned or beside the axis (COORDBRK in .zmx; ADE, BDE, CDE, XDE or YDE in .seq), and"
+    " the focal length of mirrors so turned is not found; write the lens with its mirrors on one"
+    " axis, without the flat ones that fold it"
+)
 ENDINGS = frozenset({".zmx", ".seq", ".json"})
 MAX_BYTES = 50_000_000
 POINTS = 5  # field points along each side
@@ -74,11 +81,13 @@ class Traced:
 
 @dataclass(frozen=True, slots=True)
 class _Lens:
-    """optiland's lens, its field points with their vignetting, and notes."""
+    """optiland's lens, its field points with their vignetting, notes, and what is tilted."""
 
     optic: Any
     fields: tuple[FieldPoint, ...]
     notes: tuple[str, ...] = ()
+    # The first surface that is turned or beside the axis; "" where all are on it.
+    tilted: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +149,15 @@ def _stated(path: Path, data: bytes) -> LensPrescription | None:
 
 def _of_prescription(lens: LensPrescription) -> "_Lens":
     optic, notes = optic_of(lens)
-    return _Lens(optic, lens.fields, (*lens.notes, *notes))
+    tilted = next(filter(_is_tilted, lens.surfaces), None)
+    label = "" if tilted is None else tilted.label
+    return _Lens(optic, lens.fields, (*lens.notes, *notes), label)
+
+
+def _is_tilted(surface: LensSurface) -> bool:
+    """Whether a surface is turned, or its vertex is beside the lens's axis."""
+    is_turned = not np.allclose(surface.turn, np.eye(3))
+    return is_turned or not np.allclose(surface.origin_mm[:2], 0.0)
 
 
 def _optiland_s_own(path: Path) -> "_Lens":
@@ -190,6 +207,8 @@ def _traced(
     except InputError:
         raise
     except Exception as error:  # as in `_read`
+        if type(error).__name__ == NO_PARAXIAL_RAYS and lens.tilted:
+            raise InputError(f"{lens.tilted}: {TILTED}") from error
         raise InputError(
             f"optiland cannot trace it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}"
         ) from error

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from sgp4.api import Satrec
 
 KVN_KEY = "CCSDS_OMM_VERS"
+# What sgp4 and the parsers below it raise; LookupError: an encoding that nobody knows.
+NOT_OMM = (ValueError, SyntaxError, TypeError, AttributeError, LookupError, RecursionError)
 FORM = "give two-line element sets, or OMM in JSON, XML or CSV"
 # What each key has to be where it is there.
 FIXED = {
@@ -110,7 +112,7 @@ def _fields(text: str, file: str) -> Iterator[Mapping[str, Any]]:
             yield from _of_kvn(text)
         else:
             yield from omm.parse_csv(io.StringIO(begin))
-    except (ValueError, SyntaxError, TypeError, AttributeError, RecursionError) as error:
+    except NOT_OMM as error:
         said = f"{file}: is no OMM that can be read ({shortened(error)})"
         raise InputError(f"{said}; {FORM}") from error
 

@@ -214,6 +214,9 @@ def _check(line: str, where: str) -> None:
         raise InputError(
             f"{where}: {len(line)} characters, where an element line has {LINE_LENGTH}; {LIST_FORM}"
         )
+    # SGP4's parser is C, where a NUL ends a text.
+    if not line.isprintable():
+        raise InputError(f"{where}: it has a control character: a damaged line; take the list anew")
     total = sum(map(DIGIT_SUM.__getitem__, line[:-1].encode())) % 10
     if str(total) != line[-1]:
         raise InputError(

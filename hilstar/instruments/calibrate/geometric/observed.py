@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray, IntArray
-from hilstar.basics.errors import InputError
+from hilstar.basics.errors import InputError, one_line
 from hilstar.basics.fits_headers import FitsImage, read_fits_image
 from hilstar.basics.image_files import ImageSizeError, is_fits, opened_picture
 from hilstar.basics.reading import read_bytes
@@ -208,8 +208,9 @@ def _fits(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None)
         return read_fits_image(data, size_px)
     except (ImageSizeError, InputError) as error:
         raise InputError(f"{path}: {error}") from error
-    except (OSError, ValueError, TypeError, IndexError) as error:
-        raise InputError(f"{path}: cannot be read as FITS ({error}); {advice}") from error
+    except Exception as error:  # whatever a damaged header makes Astropy raise
+        reason = one_line(str(error))
+        raise InputError(f"{path}: cannot be read as FITS ({reason}); {advice}") from error
 
 
 def _picture(

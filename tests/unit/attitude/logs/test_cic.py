@@ -85,6 +85,21 @@ def test_what_writers_have_besides_is_read(log):
     )
 
 
+@pytest.mark.parametrize("stated", ["LAST", None])
+@pytest.mark.parametrize(
+    "comment",
+    ["q1, q2, q3, q0 (real part)", "days (MJD), sec (UTC), Q1 Q2 Q3 QC", "x: q1 y: q2 z: q3 w: q4"],
+)
+def test_a_real_part_that_a_comment_has_last_is_read_there_and_that_is_said(log, stated, comment):
+    w, x, y, z = ALNILAM.split()
+    rows = [f"60310 {seconds} {x} {y} {z} {w}" for seconds in (0, 1)]
+    found = log(cic_text(rows, comment=comment, QUATERNION_TYPE=stated))
+    first = log(cic_text([f"60310 {seconds} {ALNILAM}" for seconds in (0, 1)]))
+    for one, other in zip(found.samples, first.samples, strict=True):
+        assert one.q_icrs_to_cam.tolist() == other.q_icrs_to_cam.tolist()
+    assert "the real part is the last of four" in "".join(text for _, text in found.told)
+
+
 def test_several_segments_follow_each_other(log):
     second = cic_text([f"60311 0 {ALNILAM}"])
     found = log(WHOLE + second[second.index("META_START") :])
@@ -104,6 +119,21 @@ def test_several_segments_follow_each_other(log):
             "ATTITUDE_TYPE = QUATERNION",
             "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = LAST",
             ":14: QUATERNION_TYPE = LAST, where CIC has the real part first and writers differ",
+        ),
+        (
+            "ATTITUDE_TYPE = QUATERNION",
+            "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = LAST",
+            "add what its columns are: COMMENT q1, q2, q3, q0 (real part), or COMMENT q0 (real",
+        ),
+        (
+            "ATTITUDE_TYPE = QUATERNION",
+            "COMMENT q1 q2 q3 q0\nATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = FIRST",
+            ":15: QUATERNION_TYPE = FIRST, and a comment has the real part last",
+        ),
+        (
+            "ATTITUDE_TYPE = QUATERNION",
+            "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = MIDDLE",
+            ":14: QUATERNION_TYPE = MIDDLE; write FIRST or LAST",
         ),
         (
             "REF_FRAME_A = EME2000",

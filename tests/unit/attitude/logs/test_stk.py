@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.earth import q_icrs_to_itrs
 from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.logs.stk import COUNTS, TYPES
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources.attitude_texts import stk_text
@@ -268,6 +269,16 @@ def test_what_would_be_another_attitude_is_refused_by_name_and_line(tmp_path, ol
     with pytest.raises(InputError) as caught:
         open_log(path)
     assert str(caught.value).startswith(str(path)) and words in str(caught.value)
+
+
+@pytest.mark.parametrize("form", TYPES)
+def test_a_row_of_fewer_numbers_than_its_form_has_is_refused_by_its_line(log, form):
+    """A short row of a long form left a time and its other numbers, and so a traceback."""
+    whole = COUNTS[form]
+    for count in range(whole):
+        row = " ".join(["0", *["0"] * count])
+        with pytest.raises(InputError, match=f":10: .*: write a time and {whole} numbers for"):
+            log([row], form=form, Sequence="321")
 
 
 def test_axes_of_another_body_are_refused_unless_they_are_inertial(log):

@@ -322,3 +322,18 @@ def test_a_quantity_with_two_values_is_refused(tmp_path, rows):
     with pytest.raises(InputError) as refusal:
         import_emva(tmp_path / "sheet.csv")
     assert TWO_VALUES[rows] in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [(b"BITPIX  ", b"????????"), (b"NAXIS2  ", b"????????"), (b"EXPTIME = ", b"EXPTIME = ?")],
+)
+def test_a_frame_with_a_damaged_header_is_refused_in_one_line(tmp_path, old, new):
+    """Astropy raises errors of many classes, KeyError and its own VerifyError among them."""
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:2])
+    data = flats[0].read_bytes()
+    place = data.index(old)
+    flats[0].write_bytes(data[:place] + new + data[place + len(new) :])
+    with pytest.raises(InputError, match="frame_000") as refusal:
+        measure_sensor(flats, darks)
+    assert len(str(refusal.value).splitlines()) == 1

@@ -302,6 +302,40 @@ def test_the_pupil_of_an_obstructed_lens_is_lit_in_part(tmp_path, name, data):
     assert lit == pytest.approx(lit_share(reader(data)), abs=LIT_TOLERANCE)
 
 
+def folded(second_turn_deg: float) -> bytes:
+    """A lens behind a flat mirror at 45 degrees; 45 after it follows the beam, and no other."""
+    lines = ["MODE SEQ", "UNIT MM X W X CM MR CPMM", "ENPD 10", "FTYP 0 0 1 1 0 0 0", "XFLN 0",
+             "YFLN 0", "WAVM 1 0.55 1", "PWAV 1"]  # fmt: skip
+    surfaces = [
+        ("STANDARD", "DISZ INFINITY"),
+        ("STANDARD", "STOP", "DISZ 30"),
+        ("COORDBRK", "PARM 3 45", "DISZ 0"),
+        ("STANDARD", "DISZ 0", "GLAS MIRROR 0 0 1.5 60"),
+        ("COORDBRK", f"PARM 3 {second_turn_deg}", "DISZ -30"),
+        ("STANDARD", "CURV -0.02", "DISZ -5", "GLAS ___BLANK 1 0 1.5 60"),
+        ("STANDARD", "DISZ -30"),
+        ("STANDARD", "DISZ 0"),
+    ]
+    for number, (kind, *values) in enumerate(surfaces):
+        lines += [f"SURF {number}", f"  TYPE {kind}"]
+        lines += [f"  {value}" for value in values]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def test_mirrors_and_tilts_without_a_focal_length_are_refused_by_surface_and_keyword(tmp_path):
+    pytest.importorskip("optiland", reason=WHY_SKIPPED)
+    arguments = ("--pitch-um", 6, "--resolution", "64,64", "--half-px", 8)
+    lens, out = tmp_path / "lens.zmx", tmp_path / "psf.fits"
+    lens.write_bytes(folded(45))
+    whole = run_hilstar_here("optics", "lens", lens, "-o", out, *arguments)
+    assert whole.returncode == 0, whole.stderr
+    lens.write_bytes(folded(40))
+    beside = run_hilstar_here("optics", "lens", lens, "-o", out, *arguments)
+    assert_refused(beside, 2, "lens.zmx: surface 3 (line ")
+    assert "COORDBRK" in beside.stderr
+    assert "optiland" not in beside.stderr
+
+
 @pytest.mark.parametrize(
     ("glass", "words"),
     [

@@ -236,6 +236,19 @@ def test_identifiers_that_name_no_star_alone_are_not_used_and_that_is_said(read,
         assert "6 of its stars have no identifier of their own" in caplog.text
 
 
+def test_a_hip_number_of_several_stars_stays_with_the_brightest_and_that_is_said(read, caplog):
+    numbers = [32349, 32349, 32349, 30438, 30438, 0]
+    text = lines(["hip,ra_deg,dec_deg,v_mag,bv_mag"], numbers, RA, DEC, V, BV)
+    for _ in range(2):  # the second time from the cache
+        caplog.clear()
+        catalog, _ = read(text)
+        assert sorted(catalog.hip.tolist()) == [0, 0, 0, 0, 30438, 32349]
+        assert "2 HIP numbers are of several stars each (HIP 32349 of 3)" in caplog.text
+    caplog.clear()
+    read(lines(["hip,ra_deg,dec_deg,v_mag,bv_mag"], range(1, 7), RA, DEC, V, BV), name="other.csv")
+    assert "of several stars" not in caplog.text
+
+
 def test_float_identifiers_in_fits_are_not_used_where_they_cannot_hold_them(read, tmp_path, caplog):
     for k, kind in enumerate((np.float64, np.float32, np.int64)):
         identifiers = np.array([4_000_000_000_000_000_000 + 3 * star for star in range(6)]).astype(

@@ -61,6 +61,11 @@ def test_a_number_beyond_99999_is_one_with_a_letter():
             r"tles\.txt:2: its digits add up to 7, not 8",
         ),
         (f"{FIRST}\n{SECOND[:-1]}\n", r"tles\.txt:2: 68 characters, where an element line has 69"),
+        (f"{FIRST[:8]}\0{FIRST[9:]}\n{SECOND}\n", r"tles\.txt:1: it has a control character"),
+        (
+            '<?xml version="1.0" encoding="UTF-08"?><ndm><omm></omm></ndm>',
+            r"tles\.txt: is no OMM that can be read \(unknown encoding: UTF-08\)",
+        ),
         (f"{FIRST}\n{NAME}\n{SECOND}\n", r"tles\.txt:2: element line 2 is missing after line 1"),
         (f"{NAME}\n{SECOND}\n", r"tles\.txt:2: element line 1 is missing"),
         (f"{NAME}\n{FIRST}\n", r"tles\.txt: it ends within"),

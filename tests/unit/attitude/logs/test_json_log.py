@@ -1,0 +1,117 @@
+"""JSON logs as programs write them: one object a line, indented, or one array on one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hilstar.attitude.logs.json_lines import MAX_OBJECT_CHARACTERS
+from hilstar.attitude.logs.log_file import open_log
+from hilstar.basics.errors import InputError
+from hilstar.basics.reading import MAX_LINE_CHARACTERS
+
+ROWS: list[dict[str, Any]] = [
+    {"t_ns": k * 10**7, "q": [0.5, -0.5, 0.5, 0.5], "note": 'a } " { [ \\'} for k in range(4)
+]
+NOT_UNIT = {"t_ns": 10**9, "q": [1, 1, 0, 0]}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.json"
+
+
+def lines(rows: list[dict[str, Any]]) -> str:
+    return "".join(json.dumps(row) + "\n" for row in rows)
+
+
+FORMS = {
+    "lines": lines(ROWS),
+    "lines with commas": lines(ROWS).replace("\n", ",\n"),
+    "array": json.dumps(ROWS),
+    "array with a line end": json.dumps(ROWS) + "\n",
+    "array without blanks": json.dumps(ROWS, separators=(",", ":")),
+    "array, an object a line": "[\n" + ",\n".join(map(json.dumps, ROWS)) + "\n]\n",
+    "indented array": json.dumps(ROWS, indent=2),
+    "indented array of Windows": json.dumps(ROWS, indent=2).replace("\n", "\r\n"),
+    "indented objects": "\n".join(json.dumps(row, indent=1) for row in ROWS),
+    "array with a byte order mark": "\ufeff" + json.dumps(ROWS),
+    "array after blank lines": "\n \n" + json.dumps(ROWS),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_json_is_read_however_its_objects_stand(path: Path, form: str) -> None:
+    path.write_text(FORMS[form], newline="")
+    log = open_log(path)
+    assert [sample.t_ns for sample in log.samples] == [row["t_ns"] for row in ROWS]
+    assert all(sample.q_icrs_to_cam.tolist() == ROWS[0]["q"] for sample in log.samples)
+    assert not [kind for kind, _ in log.told if kind == "log-cut"]
+
+
+def test_an_array_may_be_longer_than_any_line_of_a_table(path: Path) -> None:
+    count = MAX_LINE_CHARACTERS // 50
+    rows = [{"t_ns": k * 10**7, "q": [0.5, -0.5, 0.5, 0.5], "sequence": k} for k in range(count)]
+    text = json.dumps(rows)
+    assert len(text) > MAX_LINE_CHARACTERS
+    path.write_text(text)
+    assert [sample.sequence for sample in open_log(path).samples] == list(range(count))
+
+
+def test_an_array_that_was_cut_off_between_objects_is_read_and_that_is_said(path: Path) -> None:
+    path.write_text(json.dumps(ROWS)[:-1])
+    log = open_log(path)
+    assert len(log.samples) == len(ROWS)
+    assert next(text for kind, text in log.told if kind == "log-cut").startswith(
+        "the array has no ]"
+    )
+
+
+def test_zeros_and_rows_marked_invalid_are_left_out_of_an_array(path: Path) -> None:
+    unset = {"t_ns": -2, "q": [float("nan")] * 4}
+    lost = {"t_ns": 10**9, "q": [1, 0, 0, 0], "valid": False}
+    path.write_text(json.dumps([unset, *ROWS, lost]))
+    log = open_log(path)
+    assert [sample.t_ns for sample in log.samples] == [row["t_ns"] for row in ROWS]
+    assert {kind for kind, _ in log.told} >= {"log-start", "log-valid"}
+
+
+@pytest.mark.parametrize("valid", [False, 0, "false", "False", "0"])
+def test_an_attitude_is_left_out_however_its_program_writes_false(
+    path: Path, valid: object
+) -> None:
+    path.write_text(lines([{**ROWS[0], "valid": True}, {**ROWS[1], "valid": valid}, ROWS[2]]))
+    log = open_log(path)
+    assert [sample.t_ns for sample in log.samples] == [ROWS[0]["t_ns"], ROWS[2]["t_ns"]]
+    assert dict(log.told)["log-valid"].startswith("1 line is marked as not valid")
+
+
+REFUSED = {
+    lines([{**ROWS[0], "valid": "maybe"}]): ":1: valid is 'maybe'; write true or false",
+    lines([{**ROWS[0], "valid": None}]): ":1: valid is ",
+    json.dumps([*ROWS, NOT_UNIT]): ":1, object 5: the quaternion's norm is 1.41421",
+    json.dumps([*ROWS, NOT_UNIT], indent=0): ", object 5: the quaternion's norm is 1.41421",
+    json.dumps(ROWS)[:-20]: ":1, object 4: ",
+    lines(ROWS[:1])[:-30] + "\n" + lines(ROWS[1:]): ":1: ",
+    lines(ROWS[:1]) + "nonsense\n" + lines(ROWS[1:]): ":2: 'nonsense' is no JSON object; write",
+    "[[0, 1, 0, 0, 0],\n [1, 1, 0, 0, 0]]": "is no JSON object; write JSON lines, or an array",
+    json.dumps({"attitudes": ROWS}): ':1: key "t_ns" is there twice (an object without an end, or',
+    "{" * 3 * MAX_LINE_CHARACTERS: f":1: a JSON object of over {MAX_OBJECT_CHARACTERS} characters",
+    '{"a": "' + "x" * 3 * MAX_LINE_CHARACTERS: ":1: a JSON object of over",
+    "[]": ": contains no attitude",
+    "[" * MAX_LINE_CHARACTERS: ": contains no attitude",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
+def test_what_is_no_attitude_is_refused_with_its_place(path: Path, text: str) -> None:
+    path.write_text(text)
+    with pytest.raises(InputError) as refusal:
+        open_log(path)
+    said = str(refusal.value)
+    assert said.startswith(f"{path}:")
+    assert REFUSED[text] in said
+    assert len(said.splitlines()) == 1

@@ -49,6 +49,14 @@ def _c_constants(wire: Wire) -> list[str]:
         for k, bit in enumerate(bits):
             lines.append(f"/** {bit.meaning[0].upper()}{bit.meaning[1:]}. */")
             lines.append(f"#define HILSTAR_{group.upper()}_{bit.name.upper()} {1 << k}u")
+    for number in wire.numbers:
+        name = f"HILSTAR_{number.name.upper()}"
+        field, bit = number.field, number.first_bit
+        lines += ["", f"/** {number.meaning[0].upper()}{number.meaning[1:]}. */"]
+        lines.append(f"#define {name}({field}) ((unsigned)({field}) >> {bit})")
+        lines.append(f"/** The {field} that say it: add them to the others. */")
+        lines.append(f"#define {name}_FLAGS({number.name}) ((unsigned)({number.name}) << {bit})")
+        lines.append(f"#define HILSTAR_MAX_{number.name.upper()} {number.max}u")
     lines.append("")
     for limit in wire.limits:
         lines.append(f"/** {limit.meaning[0].upper()}{limit.meaning[1:]}. */")

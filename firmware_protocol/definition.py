@@ -85,6 +85,18 @@ class Bit:
 
 
 @dataclass(frozen=True)
+class Number:
+    """A number in the upper bits of a packet's field, from `first_bit` to the field's last."""
+
+    name: str
+    packet: str
+    field: str
+    first_bit: int
+    max: int
+    meaning: str
+
+
+@dataclass(frozen=True)
 class Limit:
     """A number that a value may not exceed."""
 
@@ -101,6 +113,7 @@ class Wire:
     version: int
     packets: tuple[Packet, ...]
     bits: dict[str, tuple[Bit, ...]]
+    numbers: tuple[Number, ...]
     limits: tuple[Limit, ...]
     bauds: list[int]
 
@@ -115,7 +128,8 @@ def load(path: Path) -> Wire:
         group: tuple(Bit(**entry) for entry in entries) for group, entries in table["bits"].items()
     }
     limits = tuple(Limit(name, **entry) for name, entry in table["limit"].items())
-    return Wire(table["version"], packets, bits, limits, table["baud_rates"])
+    numbers = tuple(Number(name, **entry) for name, entry in table["number"].items())
+    return Wire(table["version"], packets, bits, numbers, limits, table["baud_rates"])
 
 
 def _packet(name: str, entry: dict[str, Any], version: int) -> Packet:

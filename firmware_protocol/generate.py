@@ -66,6 +66,10 @@ def python_table(wire: Wire) -> str:
         lines.append("")
         for k, bit in enumerate(bits):
             lines += commented(f"{group.upper()}_{bit.name.upper()} = {1 << k}", bit.meaning)
+    for number in wire.numbers:
+        lines += ["", *comment_lines(number.meaning)]
+        lines.append(f"{number.name.upper()}_FIRST_BIT = {number.first_bit}")
+        lines.append(f"MAX_{number.name.upper()} = {number.max}")
     lines.append("")
     for limit in wire.limits:
         lines += commented(f"{limit.name.upper()} = {limit.value!r}", limit.meaning)
@@ -149,6 +153,11 @@ def _packet_section(packet: Packet, wire: Wire) -> str:
                 f"| {k} ({1 << k}) | `{bit.name}` | {bit.meaning} |"
                 for k, bit in enumerate(wire.bits[f.bits])
             ]
+        for number in wire.numbers:
+            if (number.packet, number.field) == (packet.name, f.name):
+                last_bit = 8 * f.size - 1
+                place = f"{number.first_bit} to {last_bit}"
+                lines.append(f"| {place} | `{number.name}` | {number.meaning} |")
     return "\n".join(lines)
 
 

@@ -101,6 +101,12 @@ extern "C" {
 /** The detector is blinded, as by the Sun. */
 #define HILSTAR_ANSWER_BLINDED 32u
 
+/** The sender's number, 1 to 254; 0, and 255 of a sender that sets every flag: not given. */
+#define HILSTAR_SENDER(flags) ((unsigned)(flags) >> 8)
+/** The flags that say it: add them to the others. */
+#define HILSTAR_SENDER_FLAGS(sender) ((unsigned)(sender) << 8)
+#define HILSTAR_MAX_SENDER 254u
+
 /** How far the quaternion's norm may be from 1 before the packet is refused (norm). */
 #define HILSTAR_NORM_TOLERANCE 0.001
 /** The largest magnitude of a valid rate; beyond it the packet is refused (format). */

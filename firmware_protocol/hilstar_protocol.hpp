@@ -41,6 +41,8 @@ struct Attitude {
     std::uint32_t sequence = 0;
     /** The attitude jumped since the previous packet. */
     bool discontinuity = false;
+    /** The sender's number, 1 to HILSTAR_MAX_SENDER; 0: not given. */
+    std::uint8_t sender = 0;
 };
 
 /** One side asks for the other's clock; `t1_ns` is the asker's just before the request leaves. */
@@ -85,7 +87,8 @@ inline hilstar_attitude plain(const Attitude &in)
 {
     hilstar_attitude out = {};
     out.flags = static_cast<std::uint16_t>((in.rate_cam_rad_s ? HILSTAR_FLAG_RATE_VALID : 0U) |
-                                           (in.discontinuity ? HILSTAR_FLAG_DISCONTINUITY : 0U));
+                                           (in.discontinuity ? HILSTAR_FLAG_DISCONTINUITY : 0U) |
+                                           HILSTAR_SENDER_FLAGS(in.sender));
     out.sequence = in.sequence;
     out.t_ns = in.t_ns;
     for (std::size_t i = 0; i < 4; i++)
@@ -109,6 +112,8 @@ inline int read(const std::uint8_t *packet, std::size_t length, Attitude &out)
         out.rate_cam_rad_s = {in.rate_cam_rad_s[0], in.rate_cam_rad_s[1], in.rate_cam_rad_s[2]};
     out.sequence = in.sequence;
     out.discontinuity = (in.flags & HILSTAR_FLAG_DISCONTINUITY) != 0;
+    const unsigned sender = HILSTAR_SENDER(in.flags);
+    out.sender = static_cast<std::uint8_t>(sender <= HILSTAR_MAX_SENDER ? sender : 0U);
     return result;
 }
 

@@ -57,6 +57,8 @@ ATTITUDES: dict[str, Attitude] = {
     "attitude: the last sequence before it wraps": Attitude(1, U32_MAX, 8, Q, STILL),
     "attitude: the sequence wrapped": Attitude(1, 0, 9, Q, STILL),
     "attitude: all flags, known and unknown": Attitude(0xFFFF, 10, 10, Q, STILL),
+    "attitude: of sender 7, with its rate": Attitude(0x0701, 17, 17, Q, (0.0, 0.0, 0.125)),
+    "attitude: of sender 254, after a jump": Attitude(0xFE02, 18, 18, Q, STILL),
     "attitude: negative zeros": Attitude(1, 11, 11, (1.0, -0.0, 0.0, -0.0), (-0.0, 0.0, -0.0)),
     "attitude: subnormals": Attitude(
         1, 12, 12, (1.0, TINY64, -TINY64, 2.0**-1023), (TINY32, -TINY32, 2.0**-127)

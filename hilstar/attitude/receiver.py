@@ -381,7 +381,14 @@ class Receiver:
                 self._rates.see(sample, arrival.host_ns)
                 if self._repeats.resumed():
                     self.jumps.forgive()
-                own = Arrival(arrival.host_ns, sample, arrival.raw, waited_ns, back=arrival.back)
+                own = Arrival(
+                    arrival.host_ns,
+                    sample,
+                    arrival.raw,
+                    waited_ns,
+                    back=arrival.back,
+                    address=arrival.address,
+                )
                 self._take_decided(self._senders.take(own))
             case other:
                 self.counts.received += 1

@@ -11,13 +11,15 @@ import typer
 from typer import Option
 
 from hilstar import server
+from hilstar.attitude.wire import protocol
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import check_ending, temporary_folder, written
 from hilstar.cli.options import BenchFile, check_files
 from hilstar.server.console.terminal import say
 
 FMU = (".fmu",)
-MODEL = "star_display"  # the module in the FMU
+# the modules in the FMU: the model, and the table of the wire that it imports
+MODEL, PROTOCOL = "star_display", "hilstar_protocol"
 EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
 
 
@@ -72,14 +74,22 @@ def build(folder: Path, address: str) -> Path:
         raise MachineError(EXTRA) from error
     script = folder / f"{MODEL}.py"
     shutil.copyfile(Path(server.__file__).with_name("fmu_model.py"), script)
+    table = folder / f"{PROTOCOL}.py"
+    shutil.copyfile(Path(protocol.__file__), table)
     bench = folder / "bench.json"
     bench.write_text(json.dumps({"address": address}))
     path = list(sys.path)
     try:  # PythonFMU imports the script by its name
         sys.path.insert(0, str(folder))
-        sys.modules.pop(MODEL, None)
+        _forget_modules()
         importlib.invalidate_caches()
-        return Path(FmuBuilder.build_FMU(script, folder / f"{MODEL}.fmu", project_files=[bench]))
+        made = folder / f"{MODEL}.fmu"
+        return Path(FmuBuilder.build_FMU(script, made, project_files=[bench, table]))
     finally:
         sys.path[:] = path
-        sys.modules.pop(MODEL, None)
+        _forget_modules()
+
+
+def _forget_modules() -> None:
+    for name in (MODEL, PROTOCOL):
+        sys.modules.pop(name, None)

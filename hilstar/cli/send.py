@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from hilstar.attitude.wire import protocol
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import is_command, stop_on_signal
 from hilstar.basics.process.scheduling import PromptWhileLight
@@ -52,6 +53,15 @@ def send(
         float | None, Option(metavar="S", help="Stop after this many seconds.", min=0)
     ] = None,
     wait: Annotated[float, Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
+    sender: Annotated[
+        int,
+        Option(
+            metavar="N",
+            help="The sender's number, 1 to 254, by which hilstar tells it from another; 0: none.",
+            min=0,
+            max=protocol.MAX_SENDER,
+        ),
+    ] = 0,
     lose: Share = "0",
     corrupt: Share = "0",
     reorder: Share = "0",
@@ -100,7 +110,7 @@ def send(
         if not heard(link, wait, stop):
             say("no listener yet; sending anyway")
         with progress("sending", min(total, count or math.inf)) as advance:
-            send_samples(cable, islice(samples, count), stop, in_time(advance))
+            send_samples(cable, islice(samples, count), stop, in_time(advance), sender)
     tell(cable.tally, link, as_json)
 
 

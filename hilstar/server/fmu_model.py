@@ -1,9 +1,9 @@
 """The model inside a co-simulation FMU: it sends attitudes to `hilstar serve` over UDP, and takes
 what comes back.
 
-This file is copied into the FMU. There it has the standard library and PythonFMU alone, whatever
-Python the simulation tool has: it imports nothing of hilstar. The packets are those of
-firmware_protocol/protocol.toml, to which a test holds them.
+This file is copied into the FMU, and the generated table of the wire (attitude/wire/protocol.py)
+beside it, as `hilstar_protocol`. There they have the standard library and PythonFMU alone, whatever
+Python the simulation tool has: they import nothing of hilstar.
 """
 
 import contextlib
@@ -15,24 +15,26 @@ import threading
 import time
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element, SubElement
 
 from pythonfmu import Boolean, Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real, String
 from pythonfmu.enums import Fmi2Status
 
-VERSION = 1
-ATTITUDE, TIME_REQUEST, TIME_REPLY, STATUS, ANSWER = 1, 2, 3, 4, 5
-ATTITUDE_BODY = struct.Struct("<BBHIq4d3f")
-TIME_REQUEST_BODY = struct.Struct("<BBHIq")
-TIME_REPLY_BODY = struct.Struct("<BBHIqqq")
-STATUS_BODY = struct.Struct("<BBHIqqIII")
-ANSWER_BODY = struct.Struct("<BBHIq4d3fI")
-BODIES = {TIME_REQUEST: TIME_REQUEST_BODY, STATUS: STATUS_BODY, ANSWER: ANSWER_BODY}
-RATE_VALID, ANSWER_VALID = 1, 2
+if TYPE_CHECKING:
+    from hilstar.attitude.wire import protocol
+else:
+    import hilstar_protocol as protocol
+
+# what comes back to a sender of attitudes
+BODIES = {
+    protocol.KIND_TIME_REQUEST: protocol.TIME_REQUEST_BODY,
+    protocol.KIND_STATUS: protocol.STATUS_BODY,
+    protocol.KIND_ANSWER: protocol.ANSWER_BODY,
+}
 CRC = struct.Struct("<I")
 NS_PER_S = 1_000_000_000
 LISTEN_S = 0.2
-NORM_TOLERANCE = 1e-3
 # the start value of `t_s`: the attitude's time is the communication point's
 COMMUNICATION_POINT = -1.0
 Q = ("q_w", "q_x", "q_y", "q_z")
@@ -47,7 +49,9 @@ def packed(body: bytes) -> bytes:
 
 def unpacked(packet: bytes) -> tuple[int, ...] | None:
     """The numbers of a packet that comes back; None for what is none."""
-    body = BODIES.get(packet[1]) if len(packet) > 1 and packet[0] == VERSION else None
+    if len(packet) < 2 or packet[0] != protocol.VERSION:
+        return None
+    body = BODIES.get(packet[1])
     if body is None or len(packet) != body.size + CRC.size or packet != packed(packet[: body.size]):
         return None
     return body.unpack(packet[: body.size])
@@ -149,7 +153,9 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             tuple(getattr(self, name) for name in Q),
             tuple(getattr(self, name) for name in RATE),
         )
-        if not abs(math.hypot(*q) - 1.0) <= NORM_TOLERANCE or not all(map(math.isfinite, rate)):
+        if not abs(math.hypot(*q) - 1.0) <= protocol.NORM_TOLERANCE or not all(
+            map(math.isfinite, rate)
+        ):
             line = (
                 f"q has the norm {math.hypot(*q):.6g}, rate is {rate}; connect a unit quaternion, w"
                 " first"
@@ -161,8 +167,9 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         if self._zero is None:
             self._zero = t_ns, time.monotonic_ns()
             self._begun = current_time, time.monotonic()
-        flags = RATE_VALID if self.use_rate else 0
-        body = ATTITUDE_BODY.pack(VERSION, ATTITUDE, flags, self._sequence % 2**32, t_ns, *q, *rate)
+        flags = protocol.FLAG_RATE_VALID if self.use_rate else 0
+        head = (protocol.VERSION, protocol.KIND_ATTITUDE, flags, self._sequence % 2**32, t_ns)
+        body = protocol.ATTITUDE_BODY.pack(*head, *q, *rate)
         self._sequence += 1
         with contextlib.suppress(OSError):  # no display is there now; one may come
             if self._socket is not None:
@@ -198,16 +205,14 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
 
     def _take(self, opened: socket.socket, numbers: tuple[int, ...]) -> None:
         _, kind, flags, sequence, t_ns, *rest = numbers
-        if kind == TIME_REQUEST and self._zero is not None:
-            now_ns = self._now_ns()
-            reply = TIME_REPLY_BODY.pack(
-                VERSION, TIME_REPLY, 0, sequence, t_ns, now_ns, self._now_ns()
-            )
+        if kind == protocol.KIND_TIME_REQUEST and self._zero is not None:
+            head = (protocol.VERSION, protocol.KIND_TIME_REPLY, 0, sequence, t_ns)
+            reply = protocol.TIME_REPLY_BODY.pack(*head, self._now_ns(), self._now_ns())
             with contextlib.suppress(OSError):
                 opened.send(packed(reply))
-        elif kind == STATUS:
+        elif kind == protocol.KIND_STATUS:
             self.health, self.frame, self.statuses = flags, sequence % 2**31, self.statuses + 1
-        elif kind == ANSWER and flags & ANSWER_VALID:
+        elif kind == protocol.KIND_ANSWER and flags & protocol.ANSWER_VALID:
             self.answered_q_w, self.answered_q_x, self.answered_q_y, self.answered_q_z = map(
                 float, rest[:4]
             )

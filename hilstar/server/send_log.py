@@ -184,8 +184,10 @@ def send(
     samples: Iterator[AttitudeSample],
     stop: threading.Event,
     on_sent: Callable[[int], None] = lambda count: None,
+    sender: int = 0,
 ) -> None:
-    """Send each sample at its time, stamped with this machine's monotonic clock.
+    """Send each sample at its time, stamped with this machine's monotonic clock, as the sender of
+    that number (0: not given).
 
     A sample never goes out early. A late one goes out at once: only the cable drops any.
     """
@@ -200,6 +202,7 @@ def send(
             sample.rate_cam_rad_s,
             sample.sequence,
             sample.discontinuity,
+            sender=sender,
         )
         cable.carry(encode(stamped))
         on_sent(cable.tally.total)

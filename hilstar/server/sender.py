@@ -26,6 +26,7 @@ from hilstar.attitude.wire.packet import (
     encode,
     framed,
 )
+from hilstar.attitude.wire.protocol import MAX_SENDER
 from hilstar.attitude.wire.serial_link import SerialLink, serial_target
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqSender
@@ -188,7 +189,8 @@ class Sender(Closing):
     `ipc:///PATH`, which this end binds unless `connect`. The key files are those of `hilstar keys`:
     `secret_key`, with `allowed_clients` where this end binds and `server_key` where it connects.
     `clock` gives the simulation's time in ns, of any zero. Over UDP and serial lines a thread
-    answers hilstar's time requests on it, and keeps the newest `status`. Raises InputError where
+    answers hilstar's time requests on it, and keeps the newest `status`. `sender` is this sender's
+    number, 1 to 254, by which hilstar tells it from another; 0: not given. Raises InputError where
     the road cannot be opened.
     """
 
@@ -201,7 +203,11 @@ class Sender(Closing):
         server_key: str | Path | None = None,
         allowed_clients: str | Path | None = None,
         clock: Clock = time.monotonic_ns,
+        sender: int = 0,
     ) -> None:
+        if not 0 <= sender <= MAX_SENDER:
+            raise InputError(f"sender {sender}: write 1 to {MAX_SENDER}, or 0 for no number")
+        self._number = sender
         files = (secret_key, server_key, allowed_clients)
         keys = CurveKeys(*(None if file is None else Path(file) for file in files))
         self._clock = clock
@@ -258,7 +264,7 @@ class Sender(Closing):
                 f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a"
                 " rate of 3"
             )
-        sample = checked_sample(at_ns, q, rate, self._sequence, discontinuity)
+        sample = checked_sample(at_ns, q, rate, self._sequence, discontinuity, self._number)
         if isinstance(sample, Refusal):
             raise InputError(f"{sample.detail} ({sample.reason})")
         self._sequence += 1

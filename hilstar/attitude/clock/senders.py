@@ -1,11 +1,15 @@
 """Who sends: a sender that hangs or whose clock has stopped, and a second sender on the same link;
 no I/O.
 
-A link does not say who sent a message, so the messages themselves must. A sender is known by its
-clock (`t_ns` advances as the host's does, or by its usual step for each count), its count
+A sender that gives its number (`AttitudeSample.sender`) is known by it, and over UDP one without a
+number by its address and port. Any other message must itself say who sent it: a sender is known by
+its clock (`t_ns` advances as the host's does, or by its usual step for each count), its count
 (`sequence` advances), and its sky (the attitude goes on as it turned).
 
 Laws:
+0. A message of another number, or without one of another address, than the sender shown is a
+   second sender's: it is refused until the first has been silent for `stale_after_ms`. The laws
+   below are for messages of one number or one address, and for links that show neither.
 1. A message that agrees with the sender shown in two of the three is its own: it may restart its
    count, set its clock, or turn
    to a new target without saying so, and it may mix packets that count with messages that do not.
@@ -21,7 +25,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import U32, AttitudeSample, Refusal
@@ -51,6 +55,8 @@ FORGETS, LEARNS = 0.98, 1 / 32  # decay and gain with each message, for silences
 MIN_COURSES = 8  # attitudes alone are weaker evidence than clocks and counters
 
 Turn = tuple[float, float, float]
+# a number, or an address and port; None where a message shows neither
+Identity = int | tuple[Any, ...] | None
 
 
 class Repeats:
@@ -265,6 +271,20 @@ class _Waiting(NamedTuple):
     sender: _KnownSender
 
 
+def _identity(arrival: SampleArrival) -> Identity:
+    """Who sent a message, as far as that is stated: its number, else its address, else None."""
+    return arrival.event.sender or arrival.address
+
+
+def _named(identity: Identity) -> str:
+    """An identity in words."""
+    if identity is None:
+        return "the one without a number"
+    if isinstance(identity, int):
+        return f"number {identity}"
+    return f"the one at {identity[0]} port {identity[1]}"
+
+
 class Senders:
     """Follows the sender that was there first, until it has been silent for `silent_after_ns`."""
 
@@ -272,6 +292,12 @@ class Senders:
         self._silent_after_ns = silent_after_ns
         self._notices = notices
         self._main: _KnownSender | None = None
+        # of the sender shown
+        self._identity: Identity = None
+        # host time of the newest message of another identity; it is the second sender's once the
+        # sender shown has spoken after it
+        self._other: Identity = None
+        self._other_ns: int | None = None
         # the sender shown as it was before it went elsewhere, or another took its place
         self._left: _KnownSender | None = None
         self._strangers: list[_KnownSender] = []
@@ -285,12 +311,15 @@ class Senders:
         """
         main, host_ns = self._main, arrival.host_ns
         if main is None:
-            self._main = _KnownSender.of(arrival)
-            return [arrival]
+            return self._begin(arrival)
+        if _identity(arrival) != self._identity:
+            return self._take_other(main, arrival)
+        if self._other_ns is not None:
+            self._see_other(arrival.host_ns, self._other_ns)
         self._strangers = [
             each for each in self._strangers if host_ns - each.host_ns < ANOTHER_COURSE_WITHIN_NS
         ]
-        if self._two and not self._strangers:
+        if self._two and not self._strangers and self._other_ns is None:
             self._part("the second sender is silent")
         agreed = main.agrees(arrival)
         rival = self._rival(arrival, agreed)
@@ -304,6 +333,34 @@ class Senders:
         if comes_back:
             return self._return(main, arrival)
         return self._take_strange(main, arrival, rival)
+
+    def _begin(self, arrival: SampleArrival) -> list[SampleArrival]:
+        """Show this message's sender, of which nothing but this is known."""
+        self._main, self._left = _KnownSender.of(arrival), None
+        self._identity = _identity(arrival)
+        self._strangers = []
+        return [arrival]
+
+    def _take_other(self, main: _KnownSender, arrival: SampleArrival) -> list[SampleArrival]:
+        """Refuse a message of another identity, or show its sender where the first is silent."""
+        # one that was not read for a while was not silent
+        silent_ns = arrival.host_ns - arrival.waited_ns - main.host_ns
+        if silent_ns <= self._silent_after_ns:
+            self._other, self._other_ns = _identity(arrival), arrival.host_ns
+            return [_refused(arrival)]
+        if self._two:
+            self._part("the first sender is silent; showing the other one")
+        waiting = [_refused(each.arrival) for each in self._emptied()]
+        self._other_ns = None
+        return [*waiting, *self._begin(arrival)]
+
+    def _see_other(self, host_ns: int, other_ns: int) -> None:
+        """The sender shown has spoken after another one: there are two, until that is silent."""
+        if host_ns - other_ns >= ANOTHER_COURSE_WITHIN_NS:
+            self._other_ns = None
+        elif not self._two:
+            shown, refused = _named(self._identity), _named(self._other)
+            self._tell_two(f"showing {shown}, refusing {refused}")
 
     def expire(self, host_ns: int) -> list[SampleArrival]:
         """Strangers' messages, where the sender shown has been silent for longer than it usually
@@ -374,11 +431,9 @@ class Senders:
             self._tell_two()
         return [*(_refused(each.arrival) for each in waiting), arrival]
 
-    def _tell_two(self) -> None:
+    def _tell_two(self, which: str = "showing the first, refusing the other") -> None:
         self._two = True
-        self._notices.begin(
-            SECOND, "two senders on one link: showing the first, refusing the other (source)"
-        )
+        self._notices.begin(SECOND, f"two senders on one link: {which} (source)")
 
     def _is_too_often(self, main: _KnownSender, sample: AttitudeSample) -> bool:
         """True where one sender would hardly go to and fro like that: it has only begun to

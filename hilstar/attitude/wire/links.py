@@ -128,7 +128,7 @@ class Arrival(Generic[E_co]):
     unread.
 
     `refusal` says why a packet that is an attitude is not used. `back` sends to the sender of this
-    message, where a link has several senders.
+    message, and `address` is where that is, where a link has several senders.
     """
 
     host_ns: int
@@ -137,6 +137,7 @@ class Arrival(Generic[E_co]):
     waited_ns: int = 0
     refusal: Refusal | None = None
     back: Callable[[Packet], None] | None = None
+    address: tuple[Any, ...] | None = None
 
 
 SampleArrival: TypeAlias = Arrival[AttitudeSample]

@@ -56,6 +56,8 @@ FRAME_FORM = (
     f"send attitudes of {protocol.ATTITUDE_BYTES} bytes as COBS frames, each followed by 0x00"
 )
 JSON_FORM = '{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}'
+# the number of a sender that sets every flag; in JSON it says as little
+UNSTATED_SENDER = 255
 UNIT = 1e-15  # this close, dividing by the norm would only move the last bit
 
 Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
@@ -83,6 +85,7 @@ class AttitudeSample:
     `acceleration_cam_rad_s2` (3,) is that of the rate, for sources without noise; `velocity_km_s`
     (3,), ICRS, the observer's with respect to the origin of the sender's frame, and `place_km` (3,)
     its place, about the Earth's centre both where there is one. Each is None where nobody says.
+    `sender` is the sender's number, 1 to 254; 0 where it is not given.
     """
 
     t_ns: int
@@ -93,6 +96,7 @@ class AttitudeSample:
     acceleration_cam_rad_s2: FloatArray | None = None
     velocity_km_s: FloatArray | None = None
     place_km: FloatArray | None = None
+    sender: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +176,7 @@ class _JsonAttitude(msgspec.Struct):
     rate: tuple[float, float, float] | None = None
     sequence: int = 0
     discontinuity: bool = False
+    sender: int = 0
 
 
 _json_decoder = msgspec.json.Decoder(_JsonAttitude)
@@ -183,6 +188,7 @@ def encode(packet: Packet) -> bytes:
         case AttitudeSample(rate_cam_rad_s=rate):
             flags = 0 if rate is None else protocol.FLAG_RATE_VALID
             flags |= protocol.FLAG_DISCONTINUITY if packet.discontinuity else 0
+            flags |= packet.sender << protocol.SENDER_FIRST_BIT
             head = (VERSION, protocol.KIND_ATTITUDE, flags, packet.sequence % U32, packet.t_ns)
             body = protocol.ATTITUDE_BODY.pack(
                 *head, *packet.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate)
@@ -271,9 +277,10 @@ def _decode_body(kind: int, message: bytes) -> Event:
         )
     _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
     known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
-    event = checked_sample(
-        t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY)
-    )
+    discontinuity = bool(flags & protocol.FLAG_DISCONTINUITY)
+    number = flags >> protocol.SENDER_FIRST_BIT
+    sender = 0 if number == UNSTATED_SENDER else number
+    event = checked_sample(t_ns, (w, x, y, z), known_rate, sequence, discontinuity, sender)
     if isinstance(event, Refusal) and (found := numbers_likeness(message)) is not None:
         return named_refusal(event.reason, event.detail, found, MESSAGE_FORM)
     return event
@@ -290,6 +297,7 @@ def checked_sample(
     rate: tuple[float, ...] | None,
     sequence: int = 0,
     discontinuity: bool = False,
+    sender: int = 0,
 ) -> AttitudeSample | Refusal:
     """A sample from raw numbers, or why they are not one: every source of attitudes passes
     through here.
@@ -311,6 +319,8 @@ def checked_sample(
         )
     if t_ns not in INT64:
         return Refusal("format", f"t_ns {t_ns} does not fit 64 bits")
+    if not 0 <= sender <= protocol.MAX_SENDER:
+        return Refusal("format", f"sender {sender}; write 1 to {protocol.MAX_SENDER}, or 0")
     unit = np.array(q, dtype=np.float64)
     if abs(norm - 1.0) > UNIT:
         unit /= norm
@@ -320,6 +330,7 @@ def checked_sample(
         None if rate is None else np.array(rate, dtype=np.float64),
         sequence,
         discontinuity,
+        sender=sender,
     )
 
 
@@ -349,7 +360,8 @@ def _decode_json(message: bytes) -> AttitudeSample | Refusal:
         if b"NaN" in message or b"Infinity" in message:
             return Refusal("nan", "a number is NaN or Infinity", unset=b"NaN" in message)
         return Refusal("format", f"{error}; write {JSON_FORM}")
-    return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity)
+    sender = form.sender if form.sender != UNSTATED_SENDER else 0
+    return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity, sender)
 
 
 def frame(packet: Packet) -> bytes:

@@ -60,6 +60,10 @@ ANSWER_TRACKING = 8  # the tracker follows an attitude that it knew
 ANSWER_TOO_FEW_STARS = 16  # fewer stars were found than an attitude needs
 ANSWER_BLINDED = 32  # the detector is blinded, as by the Sun
 
+# the sender's number, 1 to 254; 0, and 255 of a sender that sets every flag: not given
+SENDER_FIRST_BIT = 8
+MAX_SENDER = 254
+
 # how far the quaternion's norm may be from 1 before the packet is refused (norm)
 NORM_TOLERANCE = 0.001
 # the largest magnitude of a valid rate; beyond it the packet is refused (format)

@@ -333,9 +333,8 @@ class UdpLink(StreamLink):
         for host_ns, (data,), _, _, sender in admitted:
             peer = sender or ()
             self._credit.earn(peer, len(data))
-            arrivals.append(
-                Arrival(host_ns, self._decode(data), data, back=partial(self._answer, peer))
-            )
+            back = partial(self._answer, peer)
+            arrivals.append(Arrival(host_ns, self._decode(data), data, back=back, address=sender))
         return arrivals
 
     def _look(self, strangers: int) -> None:

@@ -4,9 +4,13 @@ answers.
 
 from __future__ import annotations
 
+import importlib
+import re
 import socket
+import sys
 import threading
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +24,7 @@ from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import AnswerPacket, TimeRequest, encode
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.server import fmu_model
+from hilstar.cli import fmu
 from hilstar.server.sender import Sender
 from tests.e2e.console.test_scpi import instrument, scpi_run
 from tests.support.benches import LIVE_BENCH, ORION_Q
@@ -117,14 +121,16 @@ def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):
             assert off_arcsec(np.array(sender.answer.q_icrs_to_cam), answered) < NEAR_ARCSEC
 
 
-def test_its_packets_are_those_of_the_wire():
-    for name in ("ATTITUDE", "TIME_REQUEST", "TIME_REPLY", "STATUS", "ANSWER"):
-        assert getattr(fmu_model, name) == getattr(protocol, f"KIND_{name}")
-        assert getattr(fmu_model, f"{name}_BODY").format == getattr(protocol, f"{name}_BODY").format
-    assert (fmu_model.RATE_VALID, fmu_model.ANSWER_VALID) == (
-        protocol.FLAG_RATE_VALID,
-        protocol.ANSWER_VALID,
-    )
+def test_its_packets_are_those_of_the_wire(tmp_path, monkeypatch):
+    """The FMU holds the generated table itself, and no layout of its own."""
+    with zipfile.ZipFile(fmu.build(tmp_path, "127.0.0.1:5560")) as made:
+        table = made.read(f"resources/{fmu.PROTOCOL}.py")
+        model = made.read(f"resources/{fmu.MODEL}.py").decode()
+    assert table == Path(protocol.__file__).read_bytes()
+    assert re.findall(r'"<[BHIqdf0-9]{2,}"', model) == []
+    monkeypatch.setitem(sys.modules, fmu.PROTOCOL, protocol)
+    monkeypatch.delitem(sys.modules, "hilstar.server.fmu_model", raising=False)
+    fmu_model = importlib.import_module("hilstar.server.fmu_model")
     assert fmu_model.unpacked(encode(TimeRequest(7, 11))) == (1, 2, 0, 7, 11)
     assert fmu_model.unpacked(b"\1\4" + bytes(38)) is None and fmu_model.unpacked(b"") is None
 

@@ -93,14 +93,19 @@ class Sender:
     first: int = 0
     offset_ns: int = 0
     counts: bool = True
+    number: int = 0
+    address: tuple[str, int] | None = None
 
     def packets(self, host0_ns: int, times: range, delay_ns: int = 50_000) -> list[Arrival]:
         found = []
         for k, after_ns in enumerate(times):
             host_ns = host0_ns + after_ns
             sequence = self.first + k * self.counts
-            sample = AttitudeSample(host_ns + self.offset_ns, self.q, np.zeros(3), sequence)
-            found.append(Arrival(host_ns + delay_ns, sample, encode(sample)))
+            sample = AttitudeSample(
+                host_ns + self.offset_ns, self.q, np.zeros(3), sequence, sender=self.number
+            )
+            raw = encode(sample)
+            found.append(Arrival(host_ns + delay_ns, sample, raw, address=self.address))
         return found
 
 
@@ -278,6 +283,61 @@ def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept
     assert run.counts.refused_by["source"] > 500
     assert abs(run.shown[-1] @ ORION) > 0.999
     assert max(run.ages_ms[-300:]) < 40
+
+
+HERE, THERE = ("127.0.0.1", 4001), ("127.0.0.1", 4002)
+IDENTITIES = {
+    "numbers": ({"number": 1}, {"number": 2}, "showing number 1, refusing number 2"),
+    "one number": ({"number": 1}, {}, "showing number 1, refusing the one without a number"),
+    "addresses": (
+        {"address": HERE},
+        {"address": THERE},
+        "showing the one at 127.0.0.1 port 4001, refusing the one at 127.0.0.1 port 4002",
+    ),
+}
+
+
+@pytest.mark.parametrize("counts", [True, False])
+@pytest.mark.parametrize("stated", IDENTITIES)
+def test_two_senders_of_one_sky_and_one_clock_are_told_by_number_or_address(stated, counts):
+    """What no clock, count or sky tells: they are alike in all three."""
+    one, other, words = IDENTITIES[stated]
+
+    def make(t0: int) -> list[Arrival]:
+        second = Sender(counts=counts, **other).packets(t0 + 2_300_000, seconds(0, 3))
+        return Sender(counts=counts, **one).packets(t0, seconds(0, 4)) + second
+
+    run = Run(make)
+    assert run.events == {"second-sender": 1}
+    assert (run.accepted, run.counts.refused_by["source"]) == (800, 600)
+    told = next(notice for notice in run.told if notice.kind == "second-sender")
+    assert words in told.detail and run.received_when_told <= 4
+
+
+@pytest.mark.parametrize("stated", IDENTITIES)
+@pytest.mark.parametrize("pause_s", [0.0, 0.1, 1.0])
+def test_another_number_or_address_takes_over_once_the_first_was_silent(stated, pause_s):
+    one, other, _ = IDENTITIES[stated]
+
+    def make(t0: int) -> list[Arrival]:
+        second = Sender(LYRA, **other).packets(t0, seconds(3 + pause_s, 6))
+        return Sender(**one).packets(t0, seconds(0, 3)) + second
+
+    run = Run(make)
+    refused_s = max(STALE_AFTER_NS / NS_PER_S - pause_s, 0)
+    assert run.counts.refused == run.counts.refused_by["source"]
+    assert run.counts.refused == pytest.approx(refused_s * NS_PER_S / PERIOD_NS, abs=1)
+    assert abs(run.shown[-1] @ LYRA) > 0.999
+    assert run.events == {}
+
+
+def test_one_number_from_another_address_is_the_same_sender():
+    def make(t0: int) -> list[Arrival]:
+        moved = Sender(first=400, number=3, address=THERE).packets(t0, seconds(2, 4))
+        return Sender(number=3, address=HERE).packets(t0, seconds(0, 2)) + moved
+
+    run = Run(make)
+    assert (run.accepted, run.events) == (800, {})
 
 
 def in_bursts(found: list[Arrival], burst: int) -> list[Arrival]:

@@ -74,6 +74,21 @@ def test_flags_say_what_is_valid():
     assert silent.discontinuity
 
 
+@pytest.mark.parametrize(("number", "expected"), [(0, 0), (1, 1), (254, 254), (255, 0)])
+def test_the_upper_byte_of_flags_is_the_sender_s_number(number, expected):
+    read = decode(packet(flags=number << 8 | 3))
+    assert (read.sender, read.discontinuity) == (expected, True)
+    in_json = f'{{"t_ns": 1, "q": [1, 0, 0, 0], "sender": {number}}}'
+    assert decode(in_json.encode()).sender == expected
+    assert decode(encode(read)).sender == expected
+
+
+@pytest.mark.parametrize("number", [-1, 256])
+def test_a_sender_s_number_that_no_packet_can_hold_is_refused(number):
+    in_json = f'{{"t_ns": 1, "q": [1, 0, 0, 0], "sender": {number}}}'
+    assert decode(in_json.encode()) == Refusal("format", f"sender {number}; write 1 to 254, or 0")
+
+
 def test_every_single_bit_error_is_refused():
     good = packet()
     for bit in range(8 * len(good)):

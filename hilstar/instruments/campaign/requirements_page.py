@@ -60,7 +60,7 @@ CURES = {
     NOT_MET: "Find what costs the most in sensitivity.csv, and change the tracker or the limit.",
     NOT_SHOWN: "Run more cases: the table says how many would show it.",
 }
-HEADER = ("requirement", "confidence", "measured", "bound", "cases", "verdict", "", "method")
+HEADER = ("requirement", "confidence", "measured", "bound", "cases", "verdict", "to show it", "method")
 METHOD = (
     "The bound is what the cases support at the stated confidence, one-sided. Met: the bound keeps"
     " the limit. Not met: the bound on the limit's other side breaks it. Not shown: the cases"

@@ -367,6 +367,10 @@ function listen() {
 
 function drawAll() {
   drawPicture();
+  drawThemed();
+}
+
+function drawThemed() {
   sky.draw();
   drawCharts();
   for (const one of histograms) one.draw();
@@ -384,7 +388,7 @@ async function start() {
   if (run.sky) sky.setSky(run.sky);
   sky.trail = run.path.q.map((q) => radecRollOf(q).slice(0, 2));
   makeCharts();
-  startTheme(drawAll);
+  startTheme(drawAll, drawThemed);
   listen();
   const lit = run.pictures.findIndex((one) => one.truth);
   if (run.pictures.length) await show(Math.max(lit, 0));

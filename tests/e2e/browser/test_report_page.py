@@ -114,7 +114,7 @@ def report(page, report_file) -> Browser:
 
 def chart_aria(page: Browser, name: str) -> str:
     return page.run(
-        f"return document.querySelector('#chart-{name} canvas').getAttribute('aria-label')"
+        f"return document.querySelector('#chart-{name} .plot').getAttribute('aria-label')"
     )
 
 
@@ -209,10 +209,10 @@ def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effec
 
 
 def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
-    chart = report.find("#chart-age canvas")
+    chart = report.find("#chart-age .plot")
     width = chart.size["width"]
     ActionChains(report).move_to_element_with_offset(
-        chart, -round(width * 0.4), 0
+        chart, -round(width * 0.3), 0
     ).click_and_hold().move_by_offset(round(width * 0.2), 0).release().perform()
     assert "of 10.0" in report.text("#range-text")
     assert "8.0 to 8.5" in chart_aria(report, "age") and "0 stale" in chart_aria(report, "age")
@@ -221,8 +221,20 @@ def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
     assert "400.0" in chart_aria(report, "age")
 
 
+def test_what_is_under_the_pointer_is_said_and_forgotten(report):
+    chart = report.find("#chart-age .plot")
+    ActionChains(report).move_to_element(chart).perform()
+    report.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 4')")
+    bars = report.find("#distributions .plot")
+    whole = report.text("#distributions .chart-text")
+    ActionChains(report).move_to_element(bars).perform()
+    report.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 0')")
+    said = report.text("#distributions .chart-text")
+    assert said != whole and said.endswith("frames")
+
+
 def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
-    report.run("document.querySelector('#chart-age canvas').focus()")
+    report.run("document.querySelector('#chart-age .plot').focus()")
     for keys in ("+", "+", Keys.ARROW_RIGHT, "-", Keys.ARROW_LEFT):
         before = report.text("#range-text")
         ActionChains(report).send_keys(keys).perform()

@@ -1,8 +1,7 @@
 // A run that is over, on the same page: all of it along its time, and any moment of it.
 
-import { Chart, timeText } from "./charts.js";
+import { Chart, Histogram, timeText } from "./charts.js";
 import { byId, clock, duration, fixed, make, quantity, write } from "./format.js";
-import { Histogram } from "./histogram.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
 import { Rows, addEvent, writeAttitude, writeRefusals } from "./panels.js";
 import { Picture } from "./picture.js";

@@ -216,7 +216,7 @@ def measured(value: float, error: float | None, unit: str = "") -> str:
     if error is None or not math.isfinite(error) or error <= 0:
         return f"{value:.4g} {unit}".rstrip()
     digits = 1 - math.floor(math.log10(error))
-    both = f" {PLUS_MINUS} ".join(_rounded(each, digits) for each in (value, error))
+    both = f" {PLUS_MINUS} ".join(_rounded(part, digits) for part in (value, error))
     return f"{both} {unit}".rstrip()
 
 

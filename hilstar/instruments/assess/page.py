@@ -88,7 +88,7 @@ def verdict_of(found: Assessment) -> Verdict:
     missed frames or an availability under AVAILABLE.
     """
     wrong, lost, missed = len(found.wrong), len(found.lock.lost), found.run.run.missed
-    words = ", ".join(
+    counts = ", ".join(
         (
             _counted(wrong, "wrong answer"),
             _counted(lost, "lost lock"),
@@ -97,10 +97,10 @@ def verdict_of(found: Assessment) -> Verdict:
     )
     headline = f"The tracker was right in {_percent(found)} of the answers due"
     if wrong or lost:
-        return Verdict(BAD, headline, f"{words}.")
+        return Verdict(BAD, headline, f"{counts}.")
     if missed or found.lock.availability < AVAILABLE:
-        return Verdict(WARN, headline, f"{words}.")
-    return Verdict(OK, headline, f"{words}.")
+        return Verdict(WARN, headline, f"{counts}.")
+    return Verdict(OK, headline, f"{counts}.")
 
 
 def _counted(count: int, noun: str) -> str:
@@ -139,7 +139,7 @@ def _count(count: int, of: str, state: str) -> KeyFigure:
 def _answers(found: Assessment) -> Card:
     """The answers over the run, with each wrong one and each outage."""
     lines = dict(lines_of(found))
-    words = [
+    rows = [
         ("answers", lines["answers"]),
         ("acquisition", lines["acquisition"]),
         ("missed frames", lines["missed frames"]),
@@ -153,7 +153,7 @@ def _answers(found: Assessment) -> Card:
     cures = [cure for count, cure in causes if count]
     return Card(
         "Answers over the run",
-        words=[table_of(words)],
+        words=[table_of(rows)],
         picture=_over_time(found),
         cure=" ".join(cures),
     )
@@ -169,8 +169,8 @@ def _events(found: Assessment) -> Iterator[Card]:
     outages = found.lock.outages
     if outages:
         rows = [
-            (each.start_s, each.length_s, YES[each.lost], each.rows, each.wrong)
-            for each in outages[:MAX_ROWS]
+            (outage.start_s, outage.length_s, YES[outage.lost], outage.rows, outage.wrong)
+            for outage in outages[:MAX_ROWS]
         ]
         table = table_of(rows, OUTAGE_COLUMNS)
         parts.append(details_of(f"{len(outages)} outages", table, printed=True))
@@ -190,25 +190,25 @@ def _errors(found: Assessment) -> Iterator[Card]:
         (axis, within(float(parts.bias_arcsec[k]), float(low[k]), float(high[k]), ARCSEC))
         for k, axis in enumerate(AXES)
     ]
-    words = [table_of(biases), paragraph("95 % intervals in brackets, by the block bootstrap.")]
+    texts = [table_of(biases), paragraph("95 % intervals in brackets, by the block bootstrap.")]
     bias = KeyFigure(
         measured(across, off, ARCSEC),
         "constant turn across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
     )
-    yield Card("Bias", bias, words)
+    yield Card("Bias", bias, texts)
     picture, reason = _field_map(found)
-    words = _about(parts.fov_arcsec, intervals.fov)
+    texts = _about(parts.fov_arcsec, intervals.fov)
     if reason:
-        words.append(paragraph(f"{reason}.", "small"))
+        texts.append(paragraph(f"{reason}.", "small"))
     figure = _across(parts.fov_arcsec, intervals.fov)
-    yield Card("Field-of-view error", figure, words, picture)
-    words = _about(parts.pixel_arcsec, intervals.pixel)
-    words.append(paragraph(f"{pixel.detail or pixel.reason}.", "small"))
-    yield Card("Pixel error", _across(parts.pixel_arcsec, intervals.pixel), words)
-    words = _about(found.noise_arcsec, intervals.noise)
-    words.append(paragraph(f"Limit of the tracker's stars: {limit_text(found.limit_arcsec)}."))
+    yield Card("Field-of-view error", figure, texts, picture)
+    texts = _about(parts.pixel_arcsec, intervals.pixel)
+    texts.append(paragraph(f"{pixel.detail or pixel.reason}.", "small"))
+    yield Card("Pixel error", _across(parts.pixel_arcsec, intervals.pixel), texts)
+    texts = _about(found.noise_arcsec, intervals.noise)
+    texts.append(paragraph(f"Limit of the tracker's stars: {limit_text(found.limit_arcsec)}."))
     figure = _across(found.noise_arcsec, intervals.noise)
-    yield Card("Noise", figure, words, _histogram(found))
+    yield Card("Noise", figure, texts, _histogram(found))
 
 
 def _across(axes: Axes, interval: FloatArray) -> KeyFigure:
@@ -278,8 +278,8 @@ def _whole_budget(found: Assessment) -> str:
         unit = "" if row.unit == COUNT else row.unit
         rows.append((row.quantity, row.axis, row.value, unit, row.low_95, row.high_95))
     header = ("quantity", "axis", "value", "unit", "from", "to")
-    words = paragraph("One sigma an axis, with 95 % intervals by the block bootstrap.")
-    return Card("Budget", words=[words, table_of(rows, header)]).html()
+    note = paragraph("One sigma an axis, with 95 % intervals by the block bootstrap.")
+    return Card("Budget", words=[note, table_of(rows, header)]).html()
 
 
 def _over_time(found: Assessment) -> str:

@@ -53,12 +53,12 @@ def verdict_of(summary: Mapping[str, Any]) -> Verdict:
     """BAD with wrong answers, WARN where cases failed or an answer is missing, else OK."""
     wrong, failed = summary["wrong"], summary["failed"]
     headline = f"The tracker was right in {_percent(summary['availability'])} of the frames"
-    words = f"{summary['cases']} cases, {failed} failed, {wrong} wrong answers."
+    counts = f"{summary['cases']} cases, {failed} failed, {wrong} wrong answers."
     if wrong:
-        return Verdict(BAD, headline, words)
+        return Verdict(BAD, headline, counts)
     if failed or summary["availability"] < 1:
-        return Verdict(WARN, headline, words)
-    return Verdict(OK, headline, words)
+        return Verdict(WARN, headline, counts)
+    return Verdict(OK, headline, counts)
 
 
 def _percent(share: float) -> str:
@@ -117,10 +117,10 @@ def _cards(
         rows.append((row.quantity, row.axis, row.value, unit, row.low_95, row.high_95))
     yield Card("Budget", words=[table_of(rows, BUDGET_COLUMNS), limit])
     files = [("table", summary["table"]), ("SHA-256", summary["sha256"])]
-    words = [table_of(files)]
+    texts = [table_of(files)]
     if summary["notes"]:
-        words.append(list_of(summary["notes"]))
-    yield Card("Table and notes", words=words)
+        texts.append(list_of(summary["notes"]))
+    yield Card("Table and notes", words=texts)
 
 
 def _failures(because: Mapping[str, int]) -> Card:

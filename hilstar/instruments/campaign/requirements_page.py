@@ -60,7 +60,16 @@ CURES = {
     NOT_MET: "Find what costs the most in sensitivity.csv, and change the tracker or the limit.",
     NOT_SHOWN: "Run more cases: the table says how many would show it.",
 }
-HEADER = ("requirement", "confidence", "measured", "bound", "cases", "verdict", "to show it", "method")
+HEADER = (
+    "requirement",
+    "confidence",
+    "measured",
+    "bound",
+    "cases",
+    "verdict",
+    "to show it",
+    "method",
+)
 METHOD = (
     "The bound is what the cases support at the stated confidence, one-sided. Met: the bound keeps"
     " the limit. Not met: the bound on the limit's other side breaks it. Not shown: the cases"
@@ -115,12 +124,12 @@ def write_requirements(
 
 def _verdict(found: list[RequirementVerdict]) -> Verdict:
     whole = verdict_of(found)
-    words = []
+    texts = []
     for verdict in (MET, NOT_MET, NOT_SHOWN):
         count = sum(each.verdict == verdict for each in found)
         if count:
-            words.append(f"{count} {verdict}")
-    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(found)}: {', '.join(words)}.")
+            texts.append(f"{count} {verdict}")
+    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(found)}: {', '.join(texts)}.")
 
 
 def _verdicts(found: list[RequirementVerdict]) -> Card:
@@ -134,8 +143,8 @@ def _verdicts(found: list[RequirementVerdict]) -> Card:
         confidence = f"{100 * each.require.confidence:g} %"
         figures = (confidence, each.value, each.bound, each.cases)
         rows.append((each.require.words, *figures, Markup(chip), more, each.method))
-    words = [table_of(rows, HEADER), paragraph(METHOD, "small")]
-    return Card("Verdicts", words=words, cure=CURES[verdict_of(found)])
+    texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
+    return Card("Verdicts", words=texts, cure=CURES[verdict_of(found)])
 
 
 def _error_card(figure: Any) -> Card:

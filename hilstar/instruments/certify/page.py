@@ -126,17 +126,18 @@ def _cards(found: Certificate, digest: str) -> Iterator[Card]:
     files = [(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()]
     yield Card("Files", words=[table_of(files, ("file", "SHA-256"))])
     rows = [
-        (words_of(each.quantity), each.region, each.star, _value(each)) for each in found.figures
+        (words_of(figure.quantity), figure.region, figure.star, _value(figure))
+        for figure in found.figures
     ]
     table = table_of(rows, ALL_COLUMNS)
-    words = [details_of(f"{len(found.figures)} figures", table, printed=True)]
-    yield Card("All figures", words=words)
+    texts = [details_of(f"{len(found.figures)} figures", table, printed=True)]
+    yield Card("All figures", words=texts)
 
 
 def _figures(found: Certificate) -> Card:
     """The worst figure of each kind and region."""
     measurands = [(words_of(name), text) for name, text in found.measurands.items()]
-    words = [
+    texts = [
         paragraph(
             "Worst of each kind and region: value, and half width of its 95 % interval (coverage"
             " factor k by Student's t)."
@@ -147,7 +148,7 @@ def _figures(found: Certificate) -> Card:
     cure = ""
     if found.conforms is False:
         cure = MISSED_CURE
-    return Card("Figures", words=words, cure=cure)
+    return Card("Figures", words=texts, cure=cure)
 
 
 def _budget(found: Certificate) -> Card:

@@ -251,7 +251,7 @@ def _cards(comparison: SkyComparison, figure: Any) -> Iterator[Card]:
     yield Card("Errors against magnitude", words=[drawing])
     differing = comparison.differing
     if differing:
-        words = [list_of(star.line() for star in differing[:MAX_LISTED])]
+        texts = [list_of(star.line() for star in differing[:MAX_LISTED])]
         if len(differing) > MAX_LISTED:
-            words.append(paragraph(f"{len(differing) - MAX_LISTED} more in compare.csv."))
-        yield Card(f"{len(differing)} stars that differ, the worst first", words=words)
+            texts.append(paragraph(f"{len(differing) - MAX_LISTED} more in compare.csv."))
+        yield Card(f"{len(differing)} stars that differ, the worst first", words=texts)

@@ -150,17 +150,19 @@ def _cards(found: Confronted, pictures: Sequence[Pictures]) -> Iterator[Card]:
 
 def _excess(excess: Excess) -> Card:
     """What the scatter is made of."""
-    words = []
+    texts = []
     for unit, whole, parts in (
         ("mag", excess.rms_mag, excess.light),
         ("px", excess.rms_px, excess.places),
     ):
         rows: list[tuple[object, ...]] = [("all", whole, "")]
-        for one in parts:
-            rms = one.rms
-            rows.append((one.name, None if math.isnan(rms) else rms, one.how))
-        words.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
-    return Card("What the scatter is made of", words=words)
+        for part in parts:
+            rms = None
+            if math.isfinite(part.rms):
+                rms = part.rms
+            rows.append((part.name, rms, part.how))
+        texts.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
+    return Card("What the scatter is made of", words=texts)
 
 
 def _summary(verdicts: Sequence[PhotoVerdict]) -> str:
@@ -175,10 +177,11 @@ def _summary(verdicts: Sequence[PhotoVerdict]) -> str:
         "missing",
     )
     rows = []
-    for one in verdicts:
-        chi2 = (one.background_chi2, one.star_chi2)
-        counts = (len(one.unexplained), len(one.missing))
-        rows.append((one.shot.photo.name, one.counted, one.rms_px, one.rms_mag, *chi2, *counts))
+    for verdict in verdicts:
+        chi2 = (verdict.background_chi2, verdict.star_chi2)
+        counts = (len(verdict.unexplained), len(verdict.missing))
+        rms = (verdict.rms_px, verdict.rms_mag)
+        rows.append((verdict.shot.photo.name, verdict.counted, *rms, *chi2, *counts))
     return table_of(rows, header, 3)
 
 
@@ -201,14 +204,14 @@ def _frame(verdict: PhotoVerdict, pictures: Pictures) -> str:
     )
     names = (*VIEWS, "blink", "side by side")
     buttons = "".join(f'<button type="button">{name}</button> ' for name in names)
-    words = paragraph(
+    note = paragraph(
         f"Names: the {MAX_NAMED} brightest stars. Squares: sources over {LISTED_SNR:g} sigmas that"
         " nothing explains. Circles: stars that are missing. Black is the sky's noise, white"
         f" {WHITE:g} sigmas above it; of the residual -{RESIDUAL:g} and +{RESIDUAL:g} sigmas.",
         "small",
     )
     views = f'<div class="views">{images}{over}</div>'
-    return f'<div class="frame"><p role="group" aria-label="View">{buttons}</p>{views}</div>{words}'
+    return f'<div class="frame"><p role="group" aria-label="View">{buttons}</p>{views}</div>{note}'
 
 
 def _brightest(verdict: PhotoVerdict) -> list[StarRow]:
@@ -406,7 +409,7 @@ def _lists(verdicts: Sequence[PhotoVerdict]) -> Iterator[Card]:
     ):
         if not rows:
             continue
-        words = [table_of(rows[:MAX_ROWS], header)]
+        texts = [table_of(rows[:MAX_ROWS], header)]
         if len(rows) > MAX_ROWS:
-            words.append(paragraph(f"{len(rows) - MAX_ROWS} more in the tables."))
-        yield Card(title, words=words)
+            texts.append(paragraph(f"{len(rows) - MAX_ROWS} more in the tables."))
+        yield Card(title, words=texts)

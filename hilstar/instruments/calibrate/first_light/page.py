@@ -61,16 +61,16 @@ def _bench_file(session: SessionFile, before: Path) -> Card:
     bench = Path(session.bench)
     old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, bench))
     difference = "\n".join(difflib.unified_diff(old, new, "before", "now", lineterm=""))
-    words = []
+    texts = []
     beats = session.beat and beat_line(session.beat)
     if beats:
-        words.append(paragraph(beats))
-    words.append(f"<pre>{escaped(difference or 'nothing was changed')}</pre>")
+        texts.append(paragraph(beats))
+    texts.append(f"<pre>{escaped(difference or 'nothing was changed')}</pre>")
     details = (
         f"<p>{escaped(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
         paragraph(f"hilstar {session.hilstar}; images: {session.seen_by}"),
     )
-    return Card("The bench file", words=words, details=details)
+    return Card("The bench file", words=texts, details=details)
 
 
 def _verdict(records: list[StepRecord]) -> Verdict:
@@ -88,8 +88,8 @@ def _verdict(records: list[StepRecord]) -> Verdict:
 
 
 def _link(record: StepRecord) -> str:
-    words = f"{record.name}: {WORDS[record.verdict]}"
-    chip = f'<span class="chip">{escaped(words)}</span>'
+    verdict = f"{record.name}: {WORDS[record.verdict]}"
+    chip = f'<span class="chip">{escaped(verdict)}</span>'
     return f'<a href="#{record.name}" data-state="{STATES[record.verdict]}">{chip}</a>'
 
 

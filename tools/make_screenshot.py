@@ -171,7 +171,7 @@ def main() -> None:
         page.size(1366, 1700)
         page.get((Path(scratch) / "report" / "report.html").as_uri())
         page.until("document.body.dataset.ready === 'true'")
-        page.press("#chart-age canvas")
+        page.press("#chart-age .plot")
         keep_both(page, "#charts", "report")
         first_light(page, Path(scratch))
 

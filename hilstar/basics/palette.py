@@ -19,8 +19,11 @@ def declarations(theme: str) -> str:
 
 
 def palette_css() -> str:
-    """The style sheet of a page with a switch: dark, unless its root says `data-theme="light"`."""
+    """The style sheet of a page with a switch: dark, unless its root says `data-theme="light"`;
+    light on paper.
+    """
     dark, light = (declarations(theme) for theme in THEMES)
     dark_root = f":root {{ color-scheme: dark; {dark} }}"
     light_root = f':root[data-theme="light"] {{ color-scheme: light; {light} }}'
-    return f"{dark_root}\n{light_root}\n"
+    on_paper = f"@media print {{ :root, :root[data-theme] {{ color-scheme: light; {light} }} }}"
+    return f"{dark_root}\n{light_root}\n{on_paper}\n"

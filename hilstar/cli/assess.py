@@ -63,7 +63,8 @@ def assess(
     availability, wrong answers.
     """
     from hilstar.instruments.assess.assessment import AssessSettings, assess_files
-    from hilstar.instruments.assess.report import budget_of, lines_of, write_page, write_tables
+    from hilstar.instruments.assess.page import write_page
+    from hilstar.instruments.assess.report import budget_of, lines_of, write_tables
 
     check_directory("-o", output)
     if not abs(latency_ms) < MAX_LATENCY_MS:

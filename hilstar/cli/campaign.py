@@ -150,6 +150,7 @@ def campaign(
                 this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes
             )
         # charts and statistics, once there is a table
+        from hilstar.instruments.campaign.page import PAGE_FILE
         from hilstar.instruments.campaign.results import lines_of, write_results
 
         summary = write_results(directory.table, this.maker.file, this.plan.seed)
@@ -172,6 +173,7 @@ def campaign(
             lines += [each.words for each in verdicts]
     finally:
         directory.close()
+    lines.append(f"{'page':20}{directory.table.with_name(PAGE_FILE)}")
     print_found(as_json, summary, lines)
     if strict and not_met:
         raise typer.Exit(1)

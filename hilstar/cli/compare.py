@@ -32,7 +32,7 @@ def compare(
     ] = None,
     output: Annotated[
         Path | None,
-        Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table."),
+        Option("-o", "--output", metavar="DIR", help="Directory for a page, a chart and a table."),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -256,7 +256,8 @@ class TrackerBeside:
         run's own figures.
         """
         from hilstar.instruments.assess.assessment import AssessSettings, assess_files
-        from hilstar.instruments.assess.report import lines_of, write_page
+        from hilstar.instruments.assess.page import write_page
+        from hilstar.instruments.assess.report import lines_of
         from hilstar.instruments.simulate.tracker_process import ROLL
         from hilstar.server.answers.judge import TrackerFigures
 

@@ -11,6 +11,10 @@ from hilstar.cli import options
 from hilstar.cli.running import explain_bench, explained_effort, optional_scenario, say_optics
 from hilstar.server.console.terminal import print_found
 
+NO_OUTPUT = (
+    "frame: no output was asked for; add -o OUT.fits, --truth OUT.csv, --codes OUT.png or --explain"
+)
+
 
 def frame(
     bench_file: options.BenchFile,
@@ -47,7 +51,8 @@ def frame(
 
     file = read_bench_file(bench_file)
     q = options.parse_attitude("frame", radec, quaternion)
-    targets = _targets(output, truth, codes, preview)
+    targets = [path for path in (output, truth, codes, preview) if path is not None]
+    _check_targets(output, truth, codes, preview, explain)
     t_ns, wrong = (
         options.parse_at("frame", at, file.config, scenario is not None),
         optional_scenario(scenario),
@@ -98,25 +103,28 @@ def frame(
         )
     if summary["faults"]:
         names += f", faults: {', '.join(summary['faults'])}"
-    drawn = f"{len(shot.rows)} stars{names}; wrote {', '.join(summary['written'])}"
+    drawn = f"{len(shot.rows)} stars{names}"
+    if targets:
+        drawn += f"; wrote {', '.join(summary['written'])}"
     print_found(as_json, summary, [drawn, fields.line(), star.line()])
     say_optics(fields, star)  # after the refusals: a failing command prints one line
 
 
-def _targets(
-    output: Path | None, truth: Path | None, codes: Path | None, preview: Path | None
-) -> list[Path]:
-    """The files to write. Raises InputError for none, and for one of another kind."""
+def _check_targets(
+    output: Path | None,
+    truth: Path | None,
+    codes: Path | None,
+    preview: Path | None,
+    explain: bool,
+) -> None:
+    """Refuse (InputError) a file of another kind, and no file where nothing is to be explained."""
     check_ending("-o", output, FITS)
     check_ending("--truth", truth, CSV)
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
-    targets = [path for path in (output, truth, codes, preview) if path is not None]
-    if not targets:
-        raise InputError(
-            "frame: no output was asked for; add -o OUT.fits, --truth OUT.csv or --codes OUT.png"
-        )
-    return targets
+    asked = output or truth or codes or preview or explain
+    if not asked:
+        raise InputError(NO_OUTPUT)
 
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:

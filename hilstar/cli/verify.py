@@ -1,8 +1,7 @@
 """hilstar verify: the digital twin of a bench."""
 
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Option
@@ -14,8 +13,6 @@ from hilstar.cli.running import optional_scenario, say_units_of
 from hilstar.server.console.terminal import print_found, print_json, progress
 
 if TYPE_CHECKING:
-    from hilstar.instruments.verify.verdict import Verdict
-    from hilstar.server.bench.bench_file import BenchFile as Bench
     from hilstar.server.bench.bench_file import HeadsFile
 
 
@@ -32,37 +29,26 @@ def verify(
     strict: Annotated[
         bool, Option("--strict", help="Exit with code 1 if the bench does not pass.")
     ] = False,
-    propose: Annotated[
-        bool,
-        Option(
-            "--propose",
-            help="Find the smallest change of the bench file with which a failing bench passes.",
-        ),
-    ] = False,
-    write: Annotated[
-        bool, Option("--write", help="Find it, and make it in the bench file.")
-    ] = False,
+    propose: Annotated[bool, Option("--propose", hidden=True)] = False,
+    write: Annotated[bool, Option("--write", hidden=True)] = False,
     scenario: ScenarioFile = None,
     as_json: Json = False,
 ) -> None:
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
     import numpy as np
 
-    from hilstar.instruments.verify.proposals import check_writable
     from hilstar.instruments.verify.summary import summarise, summary_lines, write_report
     from hilstar.instruments.verify.summary import verify as run_twin
     from hilstar.server.bench.bench_file import HeadsFile, read_bench_or_heads
 
+    if propose:
+        raise _moved_to_explain("--propose", bench_file)
+    if write:
+        raise _moved_to_explain("--write", bench_file)
     check_directory("-o", output)
     file = read_bench_or_heads(bench_file)
     if isinstance(file, HeadsFile):
-        given = {
-            "-o": output,
-            "--strict": strict,
-            "--propose": propose,
-            "--write": write,
-            "--scenario": scenario,
-        }
+        given = {"-o": output, "--strict": strict, "--scenario": scenario}
         for option in [name for name, value in given.items() if value]:
             raise InputError(
                 f"verify {option}: is of one bench; leave it out, or give one of the heads' files"
@@ -70,23 +56,27 @@ def verify(
             )
         _verify_heads(file, fields, seed, as_json)
         return
-    if write:
-        check_writable(file)
     wrong = optional_scenario(scenario)
     with progress("verifying", fields) as advance:
         verdict = run_twin(file, fields, np.random.default_rng(seed), advance, wrong)
     if output is not None:
         write_report(make_directory(output), verdict)
     summary = summarise(verdict)
-    if not as_json:
-        typer.echo("\n".join(summary_lines(summary)))
-    proposed = _proposed(file, verdict, seed, write, as_json) if propose or write else {}
     if as_json:
-        print_json(summary | proposed)
+        print_json(summary)
+    else:
+        typer.echo("\n".join(summary_lines(summary)))
     say_units_of(file)
-    mended = bool(proposed.get("written"))
-    if strict and not verdict.passed and not mended:
+    if strict and not verdict.passed:
         raise typer.Exit(1)
+
+
+def _moved_to_explain(option: str, bench_file: Path) -> InputError:
+    """The refusal of an option that tried keys of the bench file."""
+    return InputError(
+        f"verify {option}: was removed; hilstar frame {bench_file} --radec RA,DEC,ROLL --explain"
+        " lists each key that would do, with its error (--json: effort.would_do); set one yourself"
+    )
 
 
 def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> None:
@@ -112,25 +102,3 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
             )
         lines.append(f"{f'{first} to {second}':20}{told}")
     print_found(as_json, {"angles": pairs}, lines)
-
-
-def _proposed(
-    file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool
-) -> dict[str, Any]:
-    """The keys of --propose and --write in the JSON object; the lines are printed unless that is
-    wanted.
-    """
-    from hilstar.instruments.verify.proposals import proposal_lines, propose, write_proposal
-
-    if verdict.passed:
-        return {"proposal": None, "written": False}
-    with progress("changes tried", float("inf")) as advance:
-        found = propose(file, verdict, verdict.measured.field_count, seed, advance)
-    if not as_json:
-        typer.echo("\n".join(proposal_lines(file, found)))
-    written = write and bool(found.changes)
-    if written:
-        write_proposal(file, found)
-        if not as_json:
-            typer.echo(f"{'written':20}{file.path}")
-    return {"proposal": asdict(found), "written": written}

@@ -65,6 +65,16 @@ class Browser(Chrome):
         ]
         self.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": asked})
 
+    def paper(self) -> None:
+        """The page as it is printed, until `screen`; the page is told, as by printing."""
+        self.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+        self.run("window.dispatchEvent(new Event('beforeprint'))")
+
+    def screen(self) -> None:
+        """The page on the screen again, after `paper`."""
+        self.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+        self.run("window.dispatchEvent(new Event('afterprint'))")
+
     def picture(self, path: Path, whole: bool = False) -> Path:
         """A PNG of what the window shows, or of the whole page."""
         if whole:

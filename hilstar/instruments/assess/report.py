@@ -1,6 +1,4 @@
-"""An assessment for its readers: the JSON object, tables, lines on the terminal, and one page
-with charts.
-"""
+"""An assessment for its readers: the JSON object, tables and lines on the terminal."""
 
 from collections.abc import Iterator
 from dataclasses import astuple, fields
@@ -10,21 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, INK, MUTED, label_ends, panels_of, write_csv
-from hilstar.basics.files import write_whole
-from hilstar.basics.html_pages import drawing_of, escaped, page_of, table_of
-from hilstar.basics.rotation import to_matrix
+from hilstar.basics.charts import write_csv
 from hilstar.instruments.assess.assessment import Assessment
-from hilstar.instruments.assess.bench_effects import Slice
+from hilstar.instruments.assess.bench_effects import DisplayCost, Slice
 from hilstar.instruments.assess.budget import Axes, Decomposed, DecomposedRun
 from hilstar.server.bench.certificate import Certificate, off_by
 
 COUNT = "1"  # the unit of counts and shares in the tables
 PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 MAX_NAMED = 10
-MAX_POINTS = 4000
-MAX_ROWS = 200
-AXES = ("x", "y", "about the boresight")
+MAX_SHARE_SIGMA = 0.5  # a share of the display's error that is less sure says nothing
 
 
 def budget_of(found: Assessment) -> dict[str, Any]:
@@ -203,7 +196,7 @@ def _plain(row: tuple[object, ...]) -> list[object]:
 
 def lines_of(found: Assessment) -> list[tuple[str, str]]:
     """The lines of the assessment on the terminal: name and text."""
-    parts, lock, clock, display = found.found, found.lock, found.found.clock, found.display
+    parts, lock, clock = found.found, found.lock, found.found.clock
     x, y, z = parts.bias_arcsec.tolist()
     named = ", ".join(str(each.row) for each in found.wrong[:MAX_NAMED]) + (
         ", ..." if len(found.wrong) > MAX_NAMED else ""
@@ -217,16 +210,6 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
     drift = f"{1e6 * clock.drift:.2f} +- {1e6 * clock.sigma_drift:.2g} ppm"
     share, wait_s = lock.acquisition_probability, lock.acquisition_s
     wait = "-" if wait_s is None else f"{wait_s:.3g}"
-    own = "not looked at"
-    if display is not None:
-        own = (
-            f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the"
-            " boresight,"
-        )
-        own += (
-            f" at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of"
-            " it in the answers"
-        )
     answers = (
         f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and"
         f" {len(found.telemetry.t_ns)} rows"
@@ -240,9 +223,9 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("answers", answers),
         ("missed frames", found.missed_line),
         ("bias", f"x {x:.2f}, y {y:.2f}, about the boresight {z:.2f} arcsec"),
-        ("field-of-view error", _text(parts.fov_arcsec, parts.intervals.fov)),
-        ("pixel error", _text(parts.pixel_arcsec, parts.intervals.pixel)),
-        ("noise", _text(found.noise_arcsec, parts.intervals.noise)),
+        ("field-of-view error", size_text(parts.fov_arcsec, parts.intervals.fov)),
+        ("pixel error", size_text(parts.pixel_arcsec, parts.intervals.pixel)),
+        ("noise", size_text(found.noise_arcsec, parts.intervals.noise)),
         (
             "clock",
             (
@@ -261,14 +244,31 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("lock lost", f"{len(lock.lost)} times"),
         ("acquisition", "-" if share is None else f"{100 * share:.0f} %, median {wait} s"),
         ("wrong", f"{len(found.wrong)}, {where} {named}" if found.wrong else "none"),
-        ("display's own error", own),
+        ("display's own error", display_text(found.display)),
         ("limit of its stars", limit_text(found.limit_arcsec)),
-        *([("bench's own error", _bench_text(found))] if found.certificate is not None else []),
+        *([("bench's own error", bench_text(found))] if found.certificate is not None else []),
         *([("glass", found.glass.line())] if found.glass is not None else []),
     ]
 
 
-def _bench_text(found: Assessment) -> str:
+def display_text(display: DisplayCost | None) -> str:
+    """The display's own error and its share in the tracker's answers, in words."""
+    if display is None:
+        return "not looked at"
+    size = (
+        f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} arcsec about the"
+        f" boresight, at {display.attitudes} attitudes"
+    )
+    if display.sigma_seen > MAX_SHARE_SIGMA:
+        return f"{size}; it is too small beside the noise to be found in the answers"
+    share = f"{100 * display.seen:.0f} +- {100 * display.sigma_seen:.0f} %"
+    return f"{size}; {share} of it is in the answers"
+
+
+def bench_text(found: Assessment) -> str:
+    """The bench's own error by its certificate, and how much of the bias it could have made, in
+    words.
+    """
     assert found.certificate is not None
     part = bench_part(found.certificate, found.found)
     said = f"{found.certificate.line}: {off_by(found.certificate)}"
@@ -281,7 +281,8 @@ def _bench_text(found: Assessment) -> str:
     )
 
 
-def _text(axes: Axes, interval: FloatArray) -> str:
+def size_text(axes: Axes, interval: FloatArray) -> str:
+    """A part of the budget with its 95 % intervals (2, 2), arcsec, in words."""
     if axes.cross is None or axes.roll is None:
         return "cannot be told"
     (cross_low, roll_low), (cross_high, roll_high) = interval.tolist()
@@ -290,170 +291,3 @@ def _text(axes: Axes, interval: FloatArray) -> str:
         f"{cross} across, {axes.roll:.3g} ({roll_low:.3g} to {roll_high:.3g}) arcsec about the"
         " boresight"
     )
-
-
-def write_page(path: Path, found: Assessment) -> None:
-    """Write the page of an assessment as one file that needs no other. Raises InputError."""
-    budget: list[tuple[object, ...]] = [
-        (*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)
-    ]
-    pixel = found.found.components.pixel
-    body = [
-        *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
-        table_of(lines_of(found), ("", "")),
-        "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>",
-        table_of(budget, ("quantity", "axis", "value", "unit", "low", "high")),
-        "<h2>Errors over the run</h2>" + _over_time(found),
-        "<h2>What repeats with the place in the field</h2>" + _field_map(found),
-        f"<p>Pixel error: {escaped(pixel.detail or pixel.reason)}.</p>",
-        "<h2>Noise</h2>" + _histogram(found),
-    ]
-    for name, unit, slices in (
-        ("rate", "deg/s", found.by_rate),
-        ("magnitude of the field", "V mag", found.by_magnitude),
-    ):
-        header = (
-            f"from, {unit}",
-            "to",
-            "answers",
-            "noise across",
-            "noise about",
-            "error across, rms",
-            "error about, rms",
-        )
-        if slices:
-            table = table_of([astuple(each) for each in slices], header)
-            body.append(
-                f"<h2>By {name}</h2>{table}<p>Arcsec; the error's rms is about the bias.</p>"
-            )
-    if found.wrong:
-        wrong = table_of(
-            [astuple(each) for each in found.wrong[:MAX_ROWS]],
-            ("row", "t_s", "run s", "off by, deg"),
-        )
-        body.append("<h2>Wrong answers</h2>" + wrong)
-    if found.lock.outages:
-        outages = [
-            (o.start_s, o.length_s, "yes" if o.lost else "", o.rows, o.wrong)
-            for o in found.lock.outages[:MAX_ROWS]
-        ]
-        body.append(
-            "<h2>Outages</h2>"
-            + table_of(outages, ("run s", "length, s", "lock lost", "rows", "wrong"))
-        )
-    title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
-    write_whole(path, page_of(title, body))
-
-
-def _over_time(found: Assessment) -> str:
-    parts = found.found.components
-    valid = np.flatnonzero(found.telemetry.valid)
-    t_s = found.t_s[valid[found.found.row]]
-    some = np.unique(np.linspace(0, len(t_s) - 1, MAX_POINTS).astype(int))
-    repeating = parts.fov.fitted + parts.pixel.fitted
-    rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
-    finding = (
-        f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g}"
-        " about the boresight"
-    )
-    note = (
-        "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost."
-        " Dotted lines: wrong answers."
-    )
-    with panels_of(finding, 3, note=note, height_inch=7.0) as panels:
-        for axes, name, k in zip(panels, AXES, range(3), strict=True):
-            axes.plot(
-                t_s[some],
-                (repeating + parts.left)[some, k],
-                ".",
-                ms=3.5,
-                color=MUTED,
-                rasterized=True,
-            )
-            axes.plot(
-                t_s[some],
-                parts.fov.fitted[some, k],
-                ".",
-                ms=2.5,
-                color=BLUE,
-                rasterized=True,
-                label="repeats",
-            )
-            for each in found.lock.lost:
-                axes.axvspan(
-                    each.start_s, each.start_s + each.length_s, color=MUTED, alpha=0.3, lw=0
-                )
-            for wrong in found.wrong:
-                axes.axvline(wrong.run_s, color=INK, lw=1, ls=":")
-            axes.set_ylabel(f"{name} [arcsec]")
-            label_ends(axes)
-        panels[-1].set_xlabel("run time [s]")
-    return drawing_of(panels[0].figure, "errors over the run")
-
-
-def _field_map(found: Assessment) -> str:
-    parts, scale = found.found.components, found.run.scale
-    axes = to_matrix(found.found.commanded_q)
-    some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
-    mean = axes[:, 2].mean(axis=0)
-    size = float(np.linalg.norm(mean))
-    seen = axes[some] @ (mean / max(size, 1e-9))
-    if parts.fov.reason or seen[:, 2].min() < 0.3:
-        reason = (
-            parts.fov.reason
-            or "the run goes over too much of the sky for one map: see the chart over time"
-        )
-        return f"<p>{escaped(reason)}.</p>"
-    place = scale.focal_px * seen[:, :2] / seen[:, 2:]
-    largest = np.abs(parts.fov.fitted).max(axis=0)
-    finding = (
-        f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g}"
-        " about the boresight"
-    )
-    with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
-        for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
-            value, limit = parts.fov.fitted[some, k], max(float(largest[k]), 1e-6)
-            look: dict[str, Any] = {
-                "cmap": "RdBu_r",
-                "vmin": -limit,
-                "vmax": limit,
-                "rasterized": True,
-            }
-            drawn = panel.scatter(place[:, 0], place[:, 1], c=value, s=6, edgecolors="none", **look)
-            panel.figure.colorbar(
-                drawn, ax=panel, orientation="horizontal", label=f"{name} [arcsec]"
-            )
-            panel.set_aspect("equal", adjustable="datalim")
-            panel.set_xlabel("star field x [px]")
-            panel.invert_yaxis()
-        panels[0].set_ylabel("star field y [px]")
-    return drawing_of(panels[0].figure, "field-of-view error over the field")
-
-
-def _histogram(found: Assessment) -> str:
-    left, variance = found.found.components.left, found.found.components.noise_variance
-    sigmas = np.sqrt(variance)
-    finding = (
-        f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the"
-        " boresight, one sigma"
-    )
-    note = (
-        "Bars: what is left when all that repeats is taken away. Line: the normal distribution of"
-        " that sigma."
-    )
-    with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.6) as panels:
-        for k, (axes, name) in enumerate(zip(panels, AXES, strict=True)):
-            sigma = max(float(sigmas[k]), 1e-9)
-            edges = np.linspace(-5, 5, 61) * sigma
-            axes.hist(left[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
-            axes.plot(
-                edges,
-                np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),
-                color=INK,
-                lw=1.2,
-            )
-            axes.set_yscale("log")
-            axes.set_ylim(1e-6 / sigma, 1 / sigma)
-            axes.set_xlabel(f"{name} [arcsec]")
-        panels[0].set_ylabel("share [1/arcsec]")
-    return drawing_of(panels[0].figure, "noise, and the normal distribution")

@@ -17,11 +17,21 @@ from hilstar.basics.charts import (
     RED,
     panels_of,
     png,
-    svg,
     write_csv,
 )
 from hilstar.basics.files import write_whole
-from hilstar.basics.html_pages import Markup, escaped, page_of, picture_of, table_of
+from hilstar.basics.pages import (
+    BAD,
+    OK,
+    WARN,
+    Card,
+    Markup,
+    Verdict,
+    drawing_of,
+    page_of,
+    paragraph,
+    table_of,
+)
 from hilstar.basics.version import __version__
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.plan import CONDITION, Plan
@@ -39,6 +49,33 @@ from hilstar.server.bench.certificate import bench_certificate, off_by
 
 COLUMNS = ("quantity", "axis", "condition", "limit", "bound", "confidence", "cases", "verdict")
 COLOURS = {MET: GREEN, NOT_MET: RED, NOT_SHOWN: ORANGE}
+STATES = {MET: OK, NOT_MET: BAD, NOT_SHOWN: WARN}
+HEADLINES = {
+    MET: "All requirements are met",
+    NOT_MET: "A requirement is not met",
+    NOT_SHOWN: "A requirement is not shown",
+}
+CURES = {
+    MET: "",
+    NOT_MET: "Find what costs the most in sensitivity.csv, and change the tracker or the limit.",
+    NOT_SHOWN: "Run more cases: the table says how many would show it.",
+}
+HEADER = (
+    "requirement",
+    "confidence",
+    "measured",
+    "bound",
+    "cases",
+    "verdict",
+    "to show it",
+    "method",
+)
+METHOD = (
+    "The bound is what the cases support at the stated confidence, one-sided. Met: the bound keeps"
+    " the limit. Not met: the bound on the limit's other side breaks it. Not shown: the cases"
+    " decide neither. Quantities are those of ECSS-E-ST-60-20C; errors are one sigma an axis,"
+    " arcsec, camera axes; times in seconds."
+)
 # one sigma across, which the chart's bins are too
 DRAWN = ("noise", "nea", "fov-error", "pixel-error")
 MAX_POINTS, MAX_BINS, MIN_IN_BIN = 4000, 10, 12
@@ -76,57 +113,43 @@ def write_requirements(
         ("program", f"hilstar {__version__}"),
         *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
-    counts = [
-        (verdict, sum(each.verdict == verdict for each in found))
-        for verdict in (MET, NOT_MET, NOT_SHOWN)
-    ]
-    each_count = ", ".join(f"{count} {verdict}" for verdict, count in counts if count)
-    page = [
-        (
-            f"<p>{_badge(verdict_of(found))}"
-            f" {escaped(f'Of {len(found)} requirements {each_count}.')}</p>"
-        ),
-        table_of(about),
-        "<h2>Verdicts</h2>",
-        table_of(
-            [
-                (
-                    *(
-                        each.require.words,
-                        f"{100 * each.require.confidence:g} %",
-                        each.value,
-                        each.bound,
-                        each.cases,
-                    ),
-                    Markup(_badge(each.verdict)),
-                    (
-                        f"about {each.more} more cases"
-                        if each.verdict == NOT_SHOWN and each.more
-                        else ""
-                    ),
-                    each.method,
-                )
-                for each in found
-            ],
-            ("requirement", "confidence", "measured", "bound", "cases", "verdict", "", "method"),
-        ),
-        (
-            "<p>The bound is what the cases support at the stated confidence, one-sided. Met: the"
-            " bound keeps the limit. Not met: the bound on the limit's other side breaks it. Not"
-            " shown: the cases decide neither. Quantities are those of ECSS-E-ST-60-20C; errors are"
-            " one sigma an axis, arcsec, camera axes; times in seconds.</p>"
-        ),
-        "<h2>Error against rate</h2>",
-        picture_of(
-            svg(figure).encode(),
-            "svg+xml",
-            "error across the boresight against rate, with the requirements",
-        ),
-        "<h2>Signed</h2>",
-        "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN),
-    ]
-    write_whole(table.with_name("requirements.html"), page_of(f"Requirements of {path.name}", page))
+    parts = [_verdicts(found).html(), _error_card(figure).html()]
+    parts.append(Card("Campaign", words=[table_of(about)]).html())
+    names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
+    parts.append(Card("Signed", words=[names]).html())
+    page = page_of(f"Requirements of {path.name}", _verdict(found), parts)
+    write_whole(table.with_name("requirements.html"), page)
     return found
+
+
+def _verdict(found: list[RequirementVerdict]) -> Verdict:
+    whole = verdict_of(found)
+    texts = []
+    for verdict in (MET, NOT_MET, NOT_SHOWN):
+        count = sum(each.verdict == verdict for each in found)
+        if count:
+            texts.append(f"{count} {verdict}")
+    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(found)}: {', '.join(texts)}.")
+
+
+def _verdicts(found: list[RequirementVerdict]) -> Card:
+    """A row for each requirement."""
+    rows = []
+    for each in found:
+        more = ""
+        if each.verdict == NOT_SHOWN and each.more:
+            more = f"about {each.more} more cases"
+        chip = f'<span class="chip" data-state="{STATES[each.verdict]}">{each.verdict}</span>'
+        confidence = f"{100 * each.require.confidence:g} %"
+        figures = (confidence, each.value, each.bound, each.cases)
+        rows.append((each.require.words, *figures, Markup(chip), more, each.method))
+    texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
+    return Card("Verdicts", words=texts, cure=CURES[verdict_of(found)])
+
+
+def _error_card(figure: Any) -> Card:
+    alt = "error across the boresight against rate, with the requirements"
+    return Card("Error against rate", words=[drawing_of(figure, alt)])
 
 
 def summary_of(each: RequirementVerdict) -> dict[str, Any]:
@@ -151,13 +174,6 @@ def verdict_of(found: list[RequirementVerdict]) -> str:
     """The verdict of all together: the worst."""
     verdicts = {each.verdict for each in found}
     return NOT_MET if NOT_MET in verdicts else NOT_SHOWN if NOT_SHOWN in verdicts else MET
-
-
-def _badge(verdict: str) -> str:
-    return (
-        '<span class="verdict"'
-        f' style="white-space:nowrap;background:{COLOURS[verdict]}">{verdict}</span>'
-    )
 
 
 def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:

@@ -25,14 +25,16 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 from hilstar.basics.arrays import FloatArray, IntArray
-from hilstar.basics.charts import INK, MUTED, chart, write_csv
+from hilstar.basics.charts import INK, MUTED, panels_of, png, write_csv
 from hilstar.basics.errors import InputError
+from hilstar.basics.files import write_whole
 from hilstar.basics.rotation import from_rotation_vectors, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.bench_effects import noise_limit
 from hilstar.instruments.assess.budget import Axes, Decomposed, assess_cases, axes_of_variance
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.assess.report import PARTS, FigureRow, limit_rows, limit_text, part_rows
+from hilstar.instruments.campaign.page import PAGE_FILE, write_campaign_page
 from hilstar.instruments.campaign.store import failures, file_sha256
 from hilstar.server.bench.bench_file import BenchFile
 
@@ -380,12 +382,10 @@ def _figure(value: float, cost: Cost) -> str:
     return f"{100 * value:.3g} %" if cost.unit == "1" else f"{value:.3g} {cost.unit}"
 
 
-def draw_costs(path: Path, found: list[Cost]) -> None:
-    """A chart of one measure's costs, with a panel for each of the parameters that cost most.
-    Raises InputError.
-    """
+def cost_chart(found: list[Cost]) -> Any:
+    """A figure of one measure's costs, with a panel for each of the parameters that cost most."""
     shown = found[:MAX_PANELS]
-    with chart(path, finding(shown), panels=len(shown), share_x=False) as axes:
+    with panels_of(finding(shown), len(shown), share_x=False) as axes:
         top = 1.15 * max(float((cost.level + cost.error).max()) for cost in shown) or 1.0
         for axis, cost in zip(axes, shown, strict=True):
             where = [float(k) for k in range(len(cost.places))]
@@ -403,18 +403,20 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
             sure = "" if cost.sure else "  (no more than noise)"
             axis.set_xlabel(f"{cost.parameter}: costs {_figure(cost.cost, cost)}{sure}")
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
+    return axes[0].figure
 
 
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
-    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the JSON
-    object of `hilstar campaign`.
+    """Write `budget.csv`, `sensitivity.csv`, a chart for each measure that varies, and the page
+    `campaign.html`; the JSON object of `hilstar campaign`.
 
     Raises InputError where the table cannot be read, or a file not be written.
     """
     because = failures(table)
     cases = read_cases(table)
     budget, parts = case_budget(cases, file, np.random.default_rng(seed))
-    write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_rows(budget, parts))
+    budget_table = list(budget_rows(budget, parts))
+    write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_table)
     found = costs(cases)
     names = (
         "measure",
@@ -450,13 +452,14 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         for each in found
     ]
     write_csv(table.with_name("sensitivity.csv"), names, rows)
-    findings = []
+    findings, charts = [], {}
     for measure in dict.fromkeys(cost.measure for cost in found):
         of_it = [cost for cost in found if cost.measure == measure]
         if max(float(cost.level.max()) for cost in of_it) > 0:
-            draw_costs(table.with_name(f"sensitivity_{measure}.png"), of_it)
+            figure = charts[WORDS[measure]] = cost_chart(of_it)
+            write_whole(table.with_name(f"sensitivity_{measure}.png"), png(figure))
             findings.append(finding(of_it))
-    return {
+    summary = {
         "cases": cases.cases,
         "failed": sum(because.values()),
         "failed_because": because,
@@ -465,6 +468,8 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         **budget,
         "findings": findings,
     }
+    write_campaign_page(table.with_name(PAGE_FILE), summary, budget_table, charts)
+    return summary
 
 
 def lines_of(summary: dict[str, Any]) -> list[str]:

@@ -11,24 +11,51 @@ import numpy as np
 
 from hilstar.basics.charts import BLUE, TEAL, panels_of, value_bars
 from hilstar.basics.files import write_whole
-from hilstar.basics.html_pages import Markup, drawing_of, escaped, page_of, table_of
+from hilstar.basics.pages import (
+    BAD,
+    OK,
+    PLAIN,
+    Card,
+    KeyFigure,
+    Markup,
+    Verdict,
+    details_of,
+    drawing_of,
+    escaped,
+    figures_of,
+    key_words,
+    list_of,
+    measured,
+    page_of,
+    paragraph,
+    table_of,
+)
 from hilstar.instruments.certify.model import THIRDS
 from hilstar.server.bench.certificate import Certificate, CertifiedFigure
 
-PRINTED = """<style>@page { size: A4; margin: 16mm } @media print {
-body { margin: 0; max-width: none; font-size: 11px }
-details { display: block } details > * { display: block } h2 { break-after: avoid }
-tr, img, p { break-inside: avoid } }
-.banner { border-left: .5rem solid; padding: .5rem 1rem; margin: 1rem 0; font-size: 1.1em }
-</style>"""
 VERDICTS = {
-    True: ("#2e7d32", "Conforms"),
-    False: ("#c62828", "Does not conform"),
-    None: ("#0b62a4", "Stated, no limits"),
+    True: (OK, "Conforms"),
+    False: (BAD, "Does not conform"),
+    None: (PLAIN, "Stated, no limits"),
 }
 SHOWN = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency")
+FIRST = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "latency")
 BARS = ("flux", "place_along", "attitude_x", "star_flux")
 MAX_BARS = 6
+MAX_APART = 20
+TWO_DIGITS = 2  # of a standard uncertainty
+QUANTITIES = {
+    "flux": "star's flux",
+    "place_along": "star's place along x",
+    "place_across": "star's place along y",
+    "attitude_x": "attitude about x",
+    "attitude_y": "attitude about y",
+    "attitude_z": "attitude about z",
+    "latency": "latency",
+    "star_flux": "star's flux against the sky",
+    "star_place_along": "star's place along x against the sky",
+    "star_place_across": "star's place along y against the sky",
+}
 RULES = {
     "guard-band": "guard band: a figure conforms where its whole 95 % interval is within its limit",
     "simple": (
@@ -36,80 +63,102 @@ RULES = {
         " uncertainty"
     ),
 }
+WORST_COLUMNS = ("quantity", "region", "value and U (95 %)", "k", "limit", "verdict")
+INPUT_COLUMNS = ("input", "distribution", "standard uncertainty", "unit", "dof", "source")
+ALL_COLUMNS = ("quantity", "region", "HIP", "value and U (95 %)")
+MISSED_CURE = (
+    "Mend the bench file's key or the bench where a figure is off, and certify again with --again."
+)
 
 
 def write_certificate_page(path: Path, found: Certificate, digest: str) -> None:
     """Write the page of a certificate whose JSON has this SHA-256. Raises InputError where it
     cannot be written.
     """
-    colour, verdict = VERDICTS[found.conforms]
-    missed = [each for each in found.figures if each.conforms is False]
-    why = (
-        f": {len(missed)} of {sum(each.conforms is not None for each in found.figures)} figures"
-        if missed
-        else ""
-    )
-    body = [
-        PRINTED,
-        (
-            f'<p class="banner" style="border-color:{colour}"><b>{verdict}{why}</b>.'
-            f" {escaped(statement(found))}</p>"
-        ),
-        table_of(_heads(found, digest)),
-        (
-            "<h2>Figures</h2><p>Worst of each kind and region: value and 95 % interval (coverage"
-            " factor k by Student's t).</p>"
-        ),
-        table_of(
-            list(_worst(found)),
-            ("quantity", "region", "value", "from", "to", "unit", "k", "dof", "limit", "verdict"),
-        ),
-        table_of([(name, text) for name, text in found.measurands.items()]),
-        "<h2>Budget</h2>",
-        *(
-            _bars(found, quantity)
-            for quantity in BARS
-            if any(each.quantity == quantity for each in found.figures)
-        ),
-        table_of(
-            [
-                (e.name, e.distribution, e.standard_uncertainty, e.unit, e.dof, e.source)
-                for e in found.inputs
-            ],
-            ("input", "distribution", "standard uncertainty", "unit", "dof", "source"),
-        ),
-        "<h2>First order against trials</h2>",
-        *_both_ways(found),
-        "<h2>Not assessed</h2>",
-        f"<ul>{''.join(f'<li>{escaped(each)}</li>' for each in found.not_assessed)}</ul>",
-        "<h2>Identity</h2>",
-        table_of([(f"monitor {key}", str(value)) for key, value in found.monitor.items()]),
-        table_of([(f"collimator {key}", str(value)) for key, value in found.collimator.items()]),
-        "<h2>Files</h2>",
-        table_of(
-            [(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()],
-            ("file", "SHA-256"),
-        ),
-        f"<details><summary>All {len(found.figures)} figures</summary>",
-        table_of(
-            [
-                (
-                    e.quantity,
-                    e.region,
-                    e.star,
-                    e.value,
-                    e.standard_uncertainty,
-                    e.lower,
-                    e.upper,
-                    e.unit,
-                )
-                for e in found.figures
-            ],
-            ("quantity", "region", "HIP", "value", "standard uncertainty", "from", "to", "unit"),
-        ),
-        "</details>",
+    parts = [figures_of(_first(found))]
+    parts += [card.html() for card in _cards(found, digest)]
+    write_whole(path, page_of(f"Certificate {found.number}", _verdict(found), parts))
+
+
+def words_of(quantity: str) -> str:
+    """A certified quantity as a person reads it."""
+    return QUANTITIES.get(quantity, key_words(quantity))
+
+
+def _verdict(found: Certificate) -> Verdict:
+    state, headline = VERDICTS[found.conforms]
+    judged = [each.conforms for each in found.figures if each.conforms is not None]
+    missed = judged.count(False)
+    if missed:
+        headline = f"{headline}: {missed} of {len(judged)} figures"
+    return Verdict(state, headline, statement(found))
+
+
+def _first(found: Certificate) -> Iterator[KeyFigure]:
+    """The worst figure of each kind that a user asks for first."""
+    for quantity in FIRST:
+        members = [each for each in found.figures if each.quantity == quantity]
+        if members:
+            worst = max(members, key=_size)
+            yield KeyFigure(_value(worst), f"{words_of(quantity)}, worst of {len(members)}")
+
+
+def _size(figure: CertifiedFigure) -> float:
+    return max(abs(figure.lower), abs(figure.upper))
+
+
+def _value(figure: CertifiedFigure) -> str:
+    """A figure with the half width of its 95 % interval, to two digits of that."""
+    return measured(figure.value, (figure.upper - figure.lower) / 2, figure.unit)
+
+
+def _cards(found: Certificate, digest: str) -> Iterator[Card]:
+    yield _figures(found)
+    yield Card("Certificate", words=[table_of(_heads(found, digest))])
+    yield _budget(found)
+    yield Card("First order against trials", words=list(_both_ways(found)))
+    yield Card("Not assessed", words=[list_of(found.not_assessed)])
+    identity = [(f"monitor: {key_words(key)}", str(value)) for key, value in found.monitor.items()]
+    identity += [
+        (f"collimator: {key_words(key)}", str(value)) for key, value in found.collimator.items()
     ]
-    write_whole(path, page_of(f"Certificate {found.number}", body))
+    yield Card("Identity", words=[table_of(identity)])
+    files = [(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()]
+    yield Card("Files", words=[table_of(files, ("file", "SHA-256"))])
+    rows = [
+        (words_of(figure.quantity), figure.region, figure.star, _value(figure))
+        for figure in found.figures
+    ]
+    table = table_of(rows, ALL_COLUMNS)
+    texts = [details_of(f"{len(found.figures)} figures", table, printed=True)]
+    yield Card("All figures", words=texts)
+
+
+def _figures(found: Certificate) -> Card:
+    """The worst figure of each kind and region."""
+    measurands = [(words_of(name), text) for name, text in found.measurands.items()]
+    texts = [
+        paragraph(
+            "Worst of each kind and region: value, and half width of its 95 % interval (coverage"
+            " factor k by Student's t)."
+        ),
+        table_of(list(_worst(found)), WORST_COLUMNS, TWO_DIGITS + 1),
+        table_of(measurands),
+    ]
+    cure = ""
+    if found.conforms is False:
+        cure = MISSED_CURE
+    return Card("Figures", words=texts, cure=cure)
+
+
+def _budget(found: Certificate) -> Card:
+    """What the uncertainties are made of."""
+    bars = [_bars(found, quantity) for quantity in BARS]
+    rows = [
+        (each.name, each.distribution, each.standard_uncertainty, each.unit, each.dof, each.source)
+        for each in found.inputs
+    ]
+    return Card("Budget", words=[*bars, table_of(rows, INPUT_COLUMNS, TWO_DIGITS)])
 
 
 def statement(found: Certificate) -> str:
@@ -143,13 +192,8 @@ def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, ...]]:
         yield name, getattr(found, name) or "not stated"
     if found.instrument:
         of = found.instrument
-        yield (
-            "instrument",
-            (
-                f"{of['name']}, {of['date']}: U = {of['relative_expanded']:.3g} relative, k ="
-                f" {of['k']:g}"
-            ),
-        )
+        size = f"U = {of['relative_expanded']:.2g} relative, k = {of['k']:g}"
+        yield "instrument", f"{of['name']}, {of['date']}: {size}"
     yield "decision rule", RULES[found.decision]
     if found.replaces:
         yield "replaces", found.replaces
@@ -163,28 +207,21 @@ def _worst(found: Certificate) -> Iterator[tuple[object, ...]]:
         if each.quantity in SHOWN or each.quantity.startswith("star_"):
             groups[each.quantity, each.region].append(each)
     for (quantity, region), members in groups.items():
-        worst = max(members, key=lambda each: max(abs(each.lower), abs(each.upper)))
-        judged = [each.conforms for each in members if each.conforms is not None]
-        verdict = (
-            None
-            if not judged
-            else "conforms"
-            if all(judged)
-            else f"{judged.count(False)} of {len(judged)} do not"
-        )
-        dof = "unlimited" if worst.dof is None else f"{worst.dof:.0f}"
-        yield (
-            quantity,
-            region,
-            worst.value,
-            worst.lower,
-            worst.upper,
-            worst.unit,
-            worst.k,
-            dof,
-            worst.limit,
-            verdict,
-        )
+        worst = max(members, key=_size)
+        limit = None
+        if worst.limit is not None:
+            limit = f"{worst.limit:g} {worst.unit}"
+        yield words_of(quantity), region, _value(worst), worst.k, limit, _judged(members)
+
+
+def _judged(members: list[CertifiedFigure]) -> str | None:
+    """The verdict on figures of a kind and region; None without limits."""
+    judged = [each.conforms for each in members if each.conforms is not None]
+    if not judged:
+        return None
+    if all(judged):
+        return "conforms"
+    return f"{judged.count(False)} of {len(judged)} do not"
 
 
 def _bars(found: Certificate, quantity: str) -> str:
@@ -199,7 +236,7 @@ def _bars(found: Certificate, quantity: str) -> str:
         return ""
     total, unit = np.sqrt(sum(squares.values())), members[0].unit
     finding = (
-        f"{quantity}: {total:.2g} {unit} standard uncertainty, of which {ranked[0][0]}"
+        f"{words_of(quantity)}: {total:.2g} {unit} standard uncertainty, of which {ranked[0][0]}"
         f" {np.sqrt(ranked[0][1]):.2g}"
     )
     with panels_of(finding, height_inch=1.1 + 0.3 * len(ranked)) as (axes,):
@@ -210,7 +247,7 @@ def _bars(found: Certificate, quantity: str) -> str:
             [float(np.sqrt(value)) for _, value in ranked],
             colours,
         )
-    return drawing_of(axes.figure, f"budget of {quantity}")
+    return drawing_of(axes.figure, f"budget of {words_of(quantity)}")
 
 
 def _both_ways(found: Certificate) -> Iterator[str]:
@@ -239,10 +276,10 @@ def _both_ways(found: Certificate) -> Iterator[str]:
     )
     apart = [each for each in both if each.by_trials and each.by_trials.differs]
     rows = [
-        (e.quantity, e.star or e.region,
+        (words_of(e.quantity), e.star or e.region,
          e.value - e.k * e.standard_uncertainty, e.value + e.k * e.standard_uncertainty,
          e.by_trials.lower, e.by_trials.upper, e.by_trials.differs)
-        for e in apart[:20] if e.by_trials
+        for e in apart[:MAX_APART] if e.by_trials
     ]  # fmt: skip
     if rows:
         yield (

@@ -1,10 +1,11 @@
-"""What `hilstar compare -o DIR` writes: a table of all stars, and a chart of errors against
-magnitude.
+"""What `hilstar compare -o DIR` writes: a table of all stars, a chart of errors against magnitude,
+and one page with both.
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hilstar.basics.charts import (
     GREEN,
@@ -14,9 +15,25 @@ from hilstar.basics.charts import (
     PURPLE,
     RED,
     SMALL_PT,
+    capital,
     chart,
     title_lines,
     write_csv,
+)
+from hilstar.basics.files import write_whole
+from hilstar.basics.pages import (
+    BAD,
+    DASH,
+    OK,
+    WARN,
+    Card,
+    KeyFigure,
+    Verdict,
+    drawing_of,
+    figures_of,
+    list_of,
+    page_of,
+    paragraph,
 )
 from hilstar.basics.units import magnitude
 from hilstar.instruments.compare.sky_comparison import SkyComparison, StarDifference, finding
@@ -26,6 +43,10 @@ if TYPE_CHECKING:
     from matplotlib.text import Annotation
     from matplotlib.transforms import Bbox
 
+PAGE_FILE = "compare.html"
+MAX_LISTED = 40  # stars on the page; the table has all
+COUNT_STATES = {True: WARN, False: OK}
+COMMON_CURE = "Compare attitude, lens and full scale of the two first: they move or dim all stars."
 MAX_NAMES = 6  # stars named in each panel; the table has all
 MAX_TRIED = 60  # names that are tried for room
 ROOM_PX = 3.0  # between two names
@@ -53,8 +74,8 @@ COLUMNS = (
 )
 
 
-def draw(path: Path, comparison: SkyComparison) -> None:
-    """Write the chart. Raises InputError where that fails."""
+def draw(path: Path, comparison: SkyComparison) -> Any:
+    """Write the chart, and return its figure. Raises InputError where that fails."""
     said = finding(comparison)
     while title_lines(said).count("\n") > 1 and ";" in said:
         said = said.rpartition(";")[0]
@@ -79,6 +100,7 @@ def draw(path: Path, comparison: SkyComparison) -> None:
                     text.remove()
                 else:
                     kept.append(box)
+    return axes[0].figure
 
 
 class ChartPanel:
@@ -170,8 +192,8 @@ class ChartPanel:
 
 
 def write_report(directory: Path, comparison: SkyComparison) -> None:
-    """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and
-    SVG.
+    """compare.csv, a row for each star; the chart compare, errors against magnitude, as PNG and
+    SVG; and the page compare.html.
 
     Raises InputError where one cannot be written.
     """
@@ -189,4 +211,47 @@ def write_report(directory: Path, comparison: SkyComparison) -> None:
         for star in comparison.stars
     ]
     write_csv(directory / "compare.csv", COLUMNS, rows)
-    draw(directory / "compare", comparison)
+    figure = draw(directory / "compare", comparison)
+    parts = [figures_of(_figures(comparison))]
+    parts += [card.html() for card in _cards(comparison, figure)]
+    write_whole(directory / PAGE_FILE, page_of("Two skies compared", _verdict(comparison), parts))
+
+
+def _verdict(comparison: SkyComparison) -> Verdict:
+    _, _, how = finding(comparison).partition(": ")
+    if comparison.same:
+        return Verdict(OK, "The same sky", capital(how))
+    return Verdict(BAD, "Not the same sky", capital(how))
+
+
+def _figures(comparison: SkyComparison) -> Iterator[KeyFigure]:
+    """How many stars there are, how far they are off at 95 %, and what only one image has."""
+    limits = comparison.limits
+    yield KeyFigure(str(comparison.star_count), "stars compared")
+    flux, place = comparison.flux_error_mag.p95, comparison.centroid_error_px.p95
+    yield _error(flux, "mag", f"flux error at 95 %; limit {limits.flux_mag:g} mag")
+    yield _error(place, "px", f"place error at 95 %; limit {limits.centroid_px:g} px")
+    for kind in ("missing", "extra"):
+        count = len(comparison.of(kind))
+        yield KeyFigure(str(count), f"{kind} stars", COUNT_STATES[count > 0])
+
+
+def _error(value: float | None, unit: str, of: str) -> KeyFigure:
+    if value is None:
+        return KeyFigure(DASH, of)
+    return KeyFigure(f"{value:.2g} {unit}", of)
+
+
+def _cards(comparison: SkyComparison, figure: Any) -> Iterator[Card]:
+    """What all stars have in common, the chart, and the stars that differ."""
+    common = comparison.common
+    if common is not None:
+        yield Card("In common", words=[paragraph(f"{capital(common.line())}.")], cure=COMMON_CURE)
+    drawing = drawing_of(figure, "errors of light and place against magnitude")
+    yield Card("Errors against magnitude", words=[drawing])
+    differing = comparison.differing
+    if differing:
+        texts = [list_of(star.line() for star in differing[:MAX_LISTED])]
+        if len(differing) > MAX_LISTED:
+            texts.append(paragraph(f"{len(differing) - MAX_LISTED} more in compare.csv."))
+        yield Card(f"{len(differing)} stars that differ, the worst first", words=texts)

@@ -1,9 +1,25 @@
-for (const box of document.querySelectorAll(".frame")) {
-  const images = box.querySelectorAll("img"), buttons = box.querySelectorAll("button"); let timer = 0;
-  const show = k => { images.forEach((one, i) => one.classList.toggle("on", i === k));
-    buttons.forEach((one, i) => one.classList.toggle("on", i === k)); };
-  const all = on => box.querySelector(".views").classList.toggle("all", on);
-  buttons.forEach((one, k) => one.addEventListener("click", () => { clearInterval(timer); timer = 0; all(k === 4);
-    if (k !== 3) { show(k); return; } let at = 0; show(0); timer = setInterval(() => show(at = 1 - at), 600); }));
-  all(true); show(4);
+const BLINK_MS = 600;
+const [BLINK, SIDE_BY_SIDE] = [3, 4];
+
+for (const frame of document.querySelectorAll(".frame")) {
+  const images = [...frame.querySelectorAll("img")];
+  const buttons = [...frame.querySelectorAll("button")];
+  const views = frame.querySelector(".views");
+  let timer = 0;
+  const show = (shown) => images.forEach((image, k) => image.classList.toggle("on", k === shown));
+  const choose = (chosen) => {
+    clearInterval(timer);
+    buttons.forEach((button, k) => {
+      button.classList.toggle("on", k === chosen);
+      button.setAttribute("aria-pressed", String(k === chosen));
+    });
+    views.classList.toggle("all", chosen === SIDE_BY_SIDE);
+    if (chosen < BLINK) show(chosen);
+    if (chosen !== BLINK) return;
+    let at = 0;
+    show(at);
+    timer = setInterval(() => show((at = 1 - at)), BLINK_MS);
+  };
+  buttons.forEach((button, k) => button.addEventListener("click", () => choose(k)));
+  choose(0);
 }

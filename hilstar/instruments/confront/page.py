@@ -5,7 +5,7 @@ and charts; one file.
 import base64
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,18 +15,43 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, INK, MUTED, ORANGE, panels_of
 from hilstar.basics.files import write_whole
-from hilstar.basics.html_pages import drawing_of, escaped, page_of, table_of
-from hilstar.instruments.confront.judge import LISTED_SNR, NOT_COUNTED, Verdict
+from hilstar.basics.pages import (
+    BAD,
+    DASH,
+    OK,
+    WARN,
+    Card,
+    KeyFigure,
+    Verdict,
+    drawing_of,
+    escaped,
+    figures_of,
+    list_of,
+    page_of,
+    paragraph,
+    table_of,
+)
+from hilstar.instruments.confront.excess import Excess
+from hilstar.instruments.confront.judge import (
+    LISTED_SNR,
+    NOT_COUNTED,
+    StarRow,
+)
+from hilstar.instruments.confront.judge import Verdict as PhotoVerdict
+from hilstar.instruments.confront.light import BRIGHT_V_MAG
 from hilstar.instruments.confront.report import Confronted
 from hilstar.instruments.confront.session import Session
 
 MAX_SIDE_PX = 960
-BLACK, WHITE = -2.0, 60.0  # sigmas of the background, between which a picture's greys lie
+# Sigmas of the background between which a picture's greys lie: the sky's noise is nearly black.
+BLACK, WHITE = 1.0, 60.0
 RESIDUAL = 5.0
 JPEG_QUALITY = 82
 MAX_ROWS = 40
+MAX_NAMED = 12  # of the brightest stars, by which a reader finds his way
+NAME_SIZE = 55  # a picture's width over the height of its names
 GRID, TILE_PER_PX, TILE_HALF_PX = 5, 8, 3
-VIEWS = ("image", "prediction", "residual")
+VIEWS = ("photograph", "prediction", "residual")
 STYLE, SCRIPT = (Path(__file__).with_suffix(ending) for ending in (".css", ".js"))
 
 
@@ -40,7 +65,7 @@ class Pictures:
     chi2_map: FloatArray
 
 
-def page_pictures(session: Session, verdict: Verdict) -> Pictures:
+def page_pictures(session: Session, verdict: PhotoVerdict) -> Pictures:
     """The pictures of a verdict, before its arrays are dropped."""
     shot = verdict.shot
     noise = np.sqrt(session.pixels.variance_dn2(shot.level.level))
@@ -70,96 +95,139 @@ def _jpeg(grey: FloatArray) -> bytes:
 
 def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> None:
     """Write the page, which needs no other file. Raises InputError where it cannot be written."""
-    verdict = (
-        "beyond the limits: " + "; ".join(found.failures)
-        if found.failures
-        else "the simulator explains these photographs"
-    )
-    body = [
-        f"<style>{STYLE.read_text()}</style>",
-        (
-            f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b>'
-            f" {escaped(verdict)}.</p>"
-        ),
-        *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
-        "<h2>Verdicts</h2><ul>"
-        + "".join(f"<li>{escaped(line)}</li>" for line in found.lines)
-        + "</ul>",
-        _summary(found.verdicts),
-    ]
+    parts = [f"<style>{STYLE.read_text()}</style>", figures_of(_figures(found.verdicts))]
+    parts += [card.html() for card in _cards(found, pictures)]
+    title = "Photographs against the simulator"
+    write_whole(path, page_of(title, _verdict(found), parts, SCRIPT.read_text()))
+
+
+def _verdict(found: Confronted) -> Verdict:
+    camera = "Its camera was fitted to them."
+    if found.session.fixed:
+        camera = "Its camera was not fitted to them."
+    if found.failures:
+        return Verdict(BAD, "Beyond the limits", f"{'; '.join(found.failures)}. {camera}")
+    return Verdict(OK, "The simulator explains these photographs", camera)
+
+
+def _figures(verdicts: Sequence[PhotoVerdict]) -> Iterator[KeyFigure]:
+    """Stars, how far they are off, and what is missing on either side; of all photographs."""
+    counted = sum(one.counted for one in verdicts)
+    yield KeyFigure(str(counted), f"stars to V = {BRIGHT_V_MAG:g}")
+    yield KeyFigure(f"{_worst(one.rms_px for one in verdicts)} px", "rms off their places")
+    yield KeyFigure(f"{_worst(one.rms_mag for one in verdicts)} mag", "rms off their light")
+    yield _count(sum(len(one.unexplained) for one in verdicts), "sources that nothing explains")
+    yield _count(sum(len(one.missing) for one in verdicts), "stars that are missing")
+
+
+def _worst(values: Iterable[float]) -> str:
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return DASH
+    return f"{max(known):.2g}"
+
+
+def _count(count: int, of: str) -> KeyFigure:
+    if count:
+        return KeyFigure(str(count), of, WARN)
+    return KeyFigure("0", of, OK)
+
+
+def _cards(found: Confronted, pictures: Sequence[Pictures]) -> Iterator[Card]:
+    """The photographs with their stars, the charts, what is odd; then how it was found."""
     for one, views in zip(found.verdicts, pictures, strict=True):
-        body.append(_frame(one, views))
-    body += [f"<h2>{title}</h2>{chart}" for title, chart in _charts(found, pictures)]
+        yield Card(one.shot.photo.name, words=[_frame(one, views)])
+    for title, chart in _charts(found, pictures):
+        yield Card(title, words=[chart])
+    yield from _lists(found.verdicts)
     if found.excess is not None:
-        body.append("<h2>What the scatter is made of</h2>")
-        for unit, whole, parts in (
-            ("mag", found.excess.rms_mag, found.excess.light),
-            ("px", found.excess.rms_px, found.excess.places),
-        ):
-            rows: list[tuple[object, ...]] = [("all", whole, "")]
-            rows += [(one.name, None if math.isnan(one.rms) else one.rms, one.how) for one in parts]
-            body.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
-    body.append(_lists(found.verdicts))
-    write_whole(
-        path,
-        page_of(
-            "Photographs against the simulator", [*body, f"<script>{SCRIPT.read_text()}</script>"]
-        ),
-    )
+        yield _excess(found.excess)
+    yield Card("Each photograph", words=[_summary(found.verdicts)])
+    yield Card("What was fitted", words=[list_of(found.lines)])
+    if found.notes:
+        yield Card("Notes", words=[list_of(found.notes)])
 
 
-def _summary(verdicts: Sequence[Verdict]) -> str:
+def _excess(excess: Excess) -> Card:
+    """What the scatter is made of."""
+    texts = []
+    for unit, whole, parts in (
+        ("mag", excess.rms_mag, excess.light),
+        ("px", excess.rms_px, excess.places),
+    ):
+        rows: list[tuple[object, ...]] = [("all", whole, "")]
+        for part in parts:
+            rms = None
+            if math.isfinite(part.rms):
+                rms = part.rms
+            rows.append((part.name, rms, part.how))
+        texts.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
+    return Card("What the scatter is made of", words=texts)
+
+
+def _summary(verdicts: Sequence[PhotoVerdict]) -> str:
     header = (
         "photograph",
-        "stars to V = 6.5",
-        "px rms",
-        "mag rms",
+        f"stars to V = {BRIGHT_V_MAG:g}",
+        "rms, px",
+        "rms, mag",
         "background chi²",
         "star chi²",
         "unexplained",
         "missing",
     )
-    rows = [
-        (
-            v.shot.photo.name,
-            v.counted,
-            v.rms_px,
-            v.rms_mag,
-            v.background_chi2,
-            v.star_chi2,
-            len(v.unexplained),
-            len(v.missing),
-        )
-        for v in verdicts
-    ]
+    rows = []
+    for verdict in verdicts:
+        chi2 = (verdict.background_chi2, verdict.star_chi2)
+        counts = (len(verdict.unexplained), len(verdict.missing))
+        rms = (verdict.rms_px, verdict.rms_mag)
+        rows.append((verdict.shot.photo.name, verdict.counted, *rms, *chi2, *counts))
     return table_of(rows, header, 3)
 
 
-def _frame(verdict: Verdict, pictures: Pictures) -> str:
+def _frame(verdict: PhotoVerdict, pictures: Pictures) -> str:
+    """A photograph, its prediction and residual, with marks and names."""
     height, width = verdict.shot.photo.dn.shape
-    marks = [
-        f'<rect x="{s.x_px - 9:.0f}" y="{s.y_px - 9:.0f}" width="18" height="18" stroke="#ff9e5e"/>'
-        for s in verdict.unexplained
-    ]
-    marks += [
-        f'<circle cx="{r.x_predicted_px:.0f}" cy="{r.y_predicted_px:.0f}" r="10" stroke="#6cb6ff"/>'
-        for r in verdict.missing
-    ]
-    over = (
-        f'<svg viewBox="-0.5 -0.5 {width} {height}" fill="none"'
-        f' stroke-width="1.5">{"".join(marks)}</svg>'
-    )
+    marks = [_name(row, width) for row in _brightest(verdict)]
+    for source in verdict.unexplained:
+        corner = f'x="{source.x_px - 9:.0f}" y="{source.y_px - 9:.0f}"'
+        marks.append(f'<rect {corner} width="18" height="18" stroke="#ff9e5e"/>')
+    for row in verdict.missing:
+        middle = f'cx="{row.x_predicted_px:.0f}" cy="{row.y_predicted_px:.0f}"'
+        marks.append(f'<circle {middle} r="10" stroke="#6cb6ff"/>')
+    view = f'viewBox="-0.5 -0.5 {width} {height}" fill="none" stroke-width="1.5"'
+    over = f'<svg {view} aria-hidden="true">{"".join(marks)}</svg>'
     images = "".join(
-        f'<img alt="{name}" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
+        f'<img alt="{name} of {escaped(verdict.shot.photo.name)}"'
+        f' src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
         for name, data in zip(VIEWS, pictures.views, strict=True)
     )
-    buttons = "".join(f"<button>{name}</button> " for name in (*VIEWS, "blink", "side by side"))
-    return (
-        f'<h2>{escaped(verdict.shot.photo.name)}</h2><div class="frame"><p>{buttons}</p><div'
-        f' class="views">{images}{over}</div></div><p class="small">Squares: sources over'
-        f" {LISTED_SNR:g} sigmas that nothing explains. Circles: stars that are missing. Residual:"
-        f" black is -{RESIDUAL:g}, white +{RESIDUAL:g} sigmas.</p>"
+    names = (*VIEWS, "blink", "side by side")
+    buttons = "".join(f'<button type="button">{name}</button> ' for name in names)
+    note = paragraph(
+        f"Names: the {MAX_NAMED} brightest stars. Squares: sources over {LISTED_SNR:g} sigmas that"
+        " nothing explains. Circles: stars that are missing. Black is the sky's noise, white"
+        f" {WHITE:g} sigmas above it; of the residual -{RESIDUAL:g} and +{RESIDUAL:g} sigmas.",
+        "small",
     )
+    views = f'<div class="views">{images}{over}</div>'
+    return f'<div class="frame"><p role="group" aria-label="View">{buttons}</p>{views}</div>{note}'
+
+
+def _brightest(verdict: PhotoVerdict) -> list[StarRow]:
+    """The brightest stars that were seen."""
+    seen = [row for row in verdict.stars if row.dn > 0]
+    return sorted(seen, key=lambda row: row.v_mag)[:MAX_NAMED]
+
+
+def _name(row: StarRow, width: int) -> str:
+    """A star's name beside it; at the left where there is no room at the right."""
+    size = width / NAME_SIZE
+    x, anchor = row.x_px + size, "start"
+    if row.x_px > 0.85 * width:
+        x, anchor = row.x_px - size, "end"
+    place = f'x="{x:.0f}" y="{row.y_px + size / 3:.0f}" font-size="{size:.1f}"'
+    return f'<text {place} text-anchor="{anchor}" fill="#ffd24a">{escaped(row.name)}</text>'
 
 
 def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
@@ -291,7 +359,7 @@ def _transfer(session: Session) -> str:
     return drawing_of(panels[0].figure, "photon transfer")
 
 
-def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str:
+def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -> str:
     chi2 = [one.background_chi2 for one in verdicts]
     columns = min(len(verdicts), 4)
     rows = math.ceil(len(verdicts) / columns)
@@ -315,7 +383,8 @@ def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str
     return drawing_of(panels[0].figure, "squared residuals over the field")
 
 
-def _lists(verdicts: Sequence[Verdict]) -> str:
+def _lists(verdicts: Sequence[PhotoVerdict]) -> Iterator[Card]:
+    """What was seen and is no star, and what is missing."""
     sources: list[tuple[object, ...]] = [
         (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr)
         for v in verdicts
@@ -333,15 +402,14 @@ def _lists(verdicts: Sequence[Verdict]) -> str:
         for v in verdicts
         for r in v.missing
     ]
-    parts = []
     for title, rows, header in (
-        ("Sources that nothing explains", sources, ("photograph", "x px", "y px", "sigmas")),
-        ("Sources that are no stars", named, ("photograph", "x px", "y px", "sigmas", "what")),
-        ("Stars that are missing", missing, ("photograph", "star", "V", "x px", "y px")),
+        ("Sources that nothing explains", sources, ("photograph", "x, px", "y, px", "sigmas")),
+        ("Sources that are no stars", named, ("photograph", "x, px", "y, px", "sigmas", "what")),
+        ("Stars that are missing", missing, ("photograph", "star", "V, mag", "x, px", "y, px")),
     ):
-        if rows:
-            more = (
-                f"<p>{len(rows) - MAX_ROWS} more in the tables.</p>" if len(rows) > MAX_ROWS else ""
-            )
-            parts.append(f"<h2>{title}</h2>{table_of(rows[:MAX_ROWS], header)}{more}")
-    return "".join(parts)
+        if not rows:
+            continue
+        texts = [table_of(rows[:MAX_ROWS], header)]
+        if len(rows) > MAX_ROWS:
+            texts.append(paragraph(f"{len(rows) - MAX_ROWS} more in the tables."))
+        yield Card(title, words=texts)

@@ -45,7 +45,10 @@ from hilstar.server.serve import Outlet
 PAGE_DIR = Path(__file__).resolve().parent / "page"
 _import = re.compile(r'^import \{ ([^}]+) \} from "\./(\w+)\.js";\n', re.MULTILINE)
 _export = re.compile(r"^export (?=(?:class|const|function) (\w+))", re.MULTILINE)
-LINKS = re.compile(r'^<(?:link rel="(?:icon|stylesheet)"|script type="module").*\n', re.MULTILINE)
+LINKS = re.compile(
+    r'^<(?:link rel="(?:icon|stylesheet)"|script type="module"|script src=).*\n', re.MULTILINE
+)
+UPLOT, UPLOT_STYLE = "uplot.min.js", "uplot.min.css"  # of npm's uplot 1.6.32, as published
 
 
 def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
@@ -90,12 +93,15 @@ def report_page(data: dict[str, Any]) -> str:
     """The page with a run's data (see `run_data`), as HTML that needs no other file and no
     network.
     """
-    html = (PAGE_DIR / "index.html").read_text(encoding="utf-8")
-    style = palette_css() + (PAGE_DIR / "page.css").read_text(encoding="utf-8")
+    html, uplot, uplot_style, page_style = (
+        (PAGE_DIR / name).read_text(encoding="utf-8")
+        for name in ("index.html", UPLOT, UPLOT_STYLE, "page.css")
+    )
+    style = palette_css() + uplot_style + page_style
     script = one_script("report")
     policy = (
-        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src data:;"
-        " base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {_hash(uplot)} {_hash(script)}; style-src {_hash(style)};"
+        " img-src data:; base-uri 'none'; form-action 'none'"
     )
     icon = base64.b64encode((PAGE_DIR / "icon.svg").read_bytes()).decode()
     head = (
@@ -104,8 +110,8 @@ def report_page(data: dict[str, Any]) -> str:
     )
     packed = base64.b64encode(zlib.compress(msgspec.json.encode(data), 9)).decode()
     tail = (
-        f'<script type="text/plain" id="run-data">{packed}</script>\n<script'
-        f' type="module">{script}</script>\n'
+        f'<script type="text/plain" id="run-data">{packed}</script>\n<script>{uplot}</script>\n'
+        f'<script type="module">{script}</script>\n'
     )
     html = LINKS.sub("", html).replace('data-mode="live"', 'data-mode="report"')
     # The data come before the script that reads them, and both after the page's own text.

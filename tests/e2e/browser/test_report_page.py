@@ -15,6 +15,7 @@ from selenium.webdriver.common.keys import Keys
 import hilstar
 from hilstar.attitude.wire.packet import decode
 from hilstar.basics.notices import Notice
+from hilstar.basics.palette import colours_of
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
@@ -113,7 +114,7 @@ def report(page, report_file) -> Browser:
 
 def chart_aria(page: Browser, name: str) -> str:
     return page.run(
-        f"return document.querySelector('#chart-{name} canvas').getAttribute('aria-label')"
+        f"return document.querySelector('#chart-{name} .plot').getAttribute('aria-label')"
     )
 
 
@@ -147,6 +148,50 @@ def test_what_comes_once_a_second_is_a_line_in_a_short_run_too(report):
     assert inked > 0.5
 
 
+def shown(page: Browser, selector: str) -> int:
+    """How many elements of a selector can be seen."""
+    return page.run(
+        "return [...document.querySelectorAll(arguments[0])].filter((one) =>"
+        " one.checkVisibility()).length",
+        selector,
+    )
+
+
+def test_on_paper_it_is_light_without_buttons_and_with_all_events(report):
+    report.prefer(color_scheme="dark")
+    many = (
+        "const list = document.getElementById('events');"
+        " for (let k = 0; k < 100; k += 1) list.append(list.lastElementChild.cloneNode(true))"
+    )
+    report.run(many)
+    pressed = "button:not(.pick), select, input"
+    assert shown(report, pressed) > 10
+    chart_before = report.run("return document.querySelector('#chart-age canvas').toDataURL()")
+    report.paper()
+    ground, panel = report.run(
+        "const style = getComputedStyle(document.documentElement);"
+        "return ['--ground', '--panel'].map((name) => style.getPropertyValue(name).trim())"
+    )
+    assert (ground, panel) == (colours_of("light")["ground"], colours_of("light")["panel"])
+    chart_now = report.run("return document.querySelector('#chart-age canvas').toDataURL()")
+    assert chart_now != chart_before  # drawn again in the light colours
+    assert shown(report, pressed) == 0
+    cut = "const list = document.getElementById('events'); return list.scrollHeight - list.clientHeight"
+    assert report.run(cut) <= 1
+    assert shown(report, "#events li") >= 102
+    report.screen()
+    report.prefer(color_scheme="dark")
+    report.until("document.documentElement.dataset.theme === 'dark'")
+    assert report.run(cut) > 1
+
+
+def test_events_are_a_list_whose_items_hold_buttons(report):
+    assert report.run("return document.querySelectorAll('#events > li[role]').length") == 0
+    assert report.run("return document.querySelectorAll('#events > li > button').length") >= 2
+    report.find("#events button").send_keys(Keys.ENTER)
+    assert report.text("#attitude-state").startswith("at ")
+
+
 def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effect_said(report):
     words = chart_aria(report, "residual")
     assert (
@@ -164,10 +209,10 @@ def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effec
 
 
 def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
-    chart = report.find("#chart-age canvas")
+    chart = report.find("#chart-age .plot")
     width = chart.size["width"]
     ActionChains(report).move_to_element_with_offset(
-        chart, -round(width * 0.4), 0
+        chart, -round(width * 0.3), 0
     ).click_and_hold().move_by_offset(round(width * 0.2), 0).release().perform()
     assert "of 10.0" in report.text("#range-text")
     assert "8.0 to 8.5" in chart_aria(report, "age") and "0 stale" in chart_aria(report, "age")
@@ -176,8 +221,20 @@ def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
     assert "400.0" in chart_aria(report, "age")
 
 
+def test_what_is_under_the_pointer_is_said_and_forgotten(report):
+    chart = report.find("#chart-age .plot")
+    ActionChains(report).move_to_element(chart).perform()
+    report.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 4')")
+    bars = report.find("#distributions .plot")
+    whole = report.text("#distributions .chart-text")
+    ActionChains(report).move_to_element(bars).perform()
+    report.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 0')")
+    said = report.text("#distributions .chart-text")
+    assert said != whole and said.endswith("frames")
+
+
 def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
-    report.run("document.querySelector('#chart-age canvas').focus()")
+    report.run("document.querySelector('#chart-age .plot').focus()")
     for keys in ("+", "+", Keys.ARROW_RIGHT, "-", Keys.ARROW_LEFT):
         before = report.text("#range-text")
         ActionChains(report).send_keys(keys).perform()
@@ -191,7 +248,7 @@ def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
 def test_an_event_leads_to_its_moment_and_to_the_picture_nearest_to_it(report, report_file):
     report.run(
         "[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind ==="
-        " 'stale').click()"
+        " 'stale').querySelector('button').click()"
     )
     assert report.text("#attitude-state") == "at 5 s"
     pictures = run_data_of(report_file.read_text())["pictures"]

@@ -165,6 +165,9 @@ def test_requirements_are_judged_and_judged_again_without_running_a_case(tmp_pat
     page = (tmp_path / "out" / "requirements.html").read_text()
     assert all(words in page for words in ("Signature", "not shown", "data:image/svg+xml;base64,"))
     assert "http" not in page.replace("http://www.w3.org", "")
+    whole = (tmp_path / "out" / "campaign.html").read_text()
+    assert "Campaign of 64 cases" in whole and "<h2>Budget</h2>" in whole
+    assert 'data-state="ok"><div><strong>The tracker was right in 100 % of the frames' in whole
     table = (tmp_path / "out" / "cases.parquet").read_bytes()
     plan.write_text(text + REQUIRE.format(0.001))  # another limit is no other campaign
     again = run_hilstar_here(*command, cwd=tmp_path)

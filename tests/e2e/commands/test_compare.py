@@ -117,6 +117,10 @@ def test_a_fault_is_told_named_and_drawn(golden, faulty, tmp_path):
         rows = {row["hip"]: row for row in csv.DictReader(file)}
     assert (rows["26727"]["kind"], rows["25930"]["kind"]) == ("changed", "missing")
     assert sum(row["kind"] != "same" for row in rows.values()) == 2
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert 'data-state="bad"><div><strong>Not the same sky</strong>' in page
+    assert "2 stars that differ, the worst first" in page
+    assert "HIP 26727 at" in page and "HIP 25930 at" in page
     # Within what rounds the figure in print.
     assert float(rows["26727"]["flux_error_mag"]) == pytest.approx(0.05, abs=1e-4)
 

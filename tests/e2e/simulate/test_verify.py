@@ -253,6 +253,29 @@ def test_what_cannot_be_verified_gets_one_line(tmp_path):
         assert_refused(run_hilstar_here("verify", path, "--fields", "1"), 2, said)
 
 
+@pytest.mark.parametrize("option", ["--propose", "--write"])
+def test_what_would_do_is_asked_of_frame_and_no_file_is_changed(tmp_path, option):
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH)
+    refused = run_hilstar_here("verify", path, option)
+    assert_refused(refused, 2, f"verify {option}: was removed; hilstar frame {path} --radec")
+    assert "--explain" in refused.stderr
+    assert "would_do" in refused.stderr
+    assert path.read_text() == BENCH
+
+
+def test_frame_explains_a_bench_without_a_file_to_write(tmp_path):
+    path = tmp_path / "bench.toml"
+    coarse = {"monitor": {"bits": 8}, "render": {"quantisation": "round"}}
+    path.write_text(bench_text(TWIN, coarse))
+    done = run_hilstar_here("frame", path, "--radec", "84,-1,0", "--explain", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["written"] == []
+    assert not found["effort"]["within"]
+    assert "[monitor] bits" in [each["key"] for each in found["effort"]["would_do"]]
+
+
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
     path = tmp_path_factory.mktemp("twin") / "bench.toml"

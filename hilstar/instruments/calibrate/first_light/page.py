@@ -3,18 +3,26 @@ the bench file.
 """
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hilstar.basics.charts import capital
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import write_whole
-from hilstar.basics.html_pages import (
+from hilstar.basics.pages import (
+    BAD,
+    DASH,
+    OK,
+    WARN,
+    Card,
+    KeyFigure,
     Markup,
-    banner_of,
+    Verdict,
     escaped,
+    key_words,
     measured,
     page_of,
+    paragraph,
     picture_of,
     table_of,
 )
@@ -26,7 +34,8 @@ from hilstar.server.sync import beat_line
 PAGE_FILE = "first-light.html"
 MAX_PICTURE_BYTES = 50_000_000
 MAX_FILES_LISTED = 12  # per step; the others are counted here, and listed in session.json
-STATES = {"done": "ok", "skipped": "warn", "failed": "bad"}
+MAX_FIGURES_BESIDE = 14  # beside a picture; the others are among the details
+STATES = {"done": OK, "skipped": WARN, "failed": BAD}
 WORDS = {"done": "passed", "skipped": "not measured", "failed": "failed"}
 
 
@@ -35,113 +44,122 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
     where it cannot be written.
     """
     bench, records = Path(session.bench), {record.name: record for record in session.steps}
-    old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, bench))
-    difference = "\n".join(difflib.unified_diff(old, new, "before", "now", lineterm=""))
-    beats = None if session.beat is None else beat_line(session.beat)
-    body = [
-        _banner(session.steps),
-        *(banner_of("bad", "Forced", each) for each in session.forced),
-        f'<nav class="steps">{"".join(_link(record) for record in session.steps)}</nav>',
-        *(
-            _card(folder, step, records[step.name], session)
-            for step in STEPS
-            if step.name in records
-        ),
-        '<section class="card"><header><h2>The bench file</h2></header><div class="words">',
-        f"<p>{escaped(beats)}</p>" if beats else "",
-        f"<pre>{escaped(difference or 'nothing was changed')}</pre></div>",
-        (
-            f"<details><summary>Details</summary><p>{escaped(bench)}, SHA-256"
-            f" <code>{session.bench_sha256}</code></p>"
-        ),
-        (
-            f"<p>hilstar {escaped(session.hilstar)}; images:"
-            f" {escaped(session.seen_by)}</p></details></section>"
-        ),
-    ]
+    links = "".join(_link(record) for record in session.steps)
+    parts = [Verdict(BAD, "Forced", each).html() for each in session.forced]
+    parts.append(f'<nav class="steps" aria-label="Steps">{links}</nav>')
+    for step in STEPS:
+        if step.name in records:
+            parts.append(_card(folder, step, records[step.name], session).html())
+    parts.append(_bench_file(session, before).html())
     path = folder / PAGE_FILE
-    write_whole(path, page_of(f"First light of {bench.name}", body))
+    write_whole(path, page_of(f"First light of {bench.name}", _verdict(session.steps), parts))
     return path
 
 
-def _banner(records: list[StepRecord]) -> str:
+def _bench_file(session: SessionFile, before: Path) -> Card:
+    """What changed in the bench file."""
+    bench = Path(session.bench)
+    old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, bench))
+    difference = "\n".join(difflib.unified_diff(old, new, "before", "now", lineterm=""))
+    texts = []
+    beats = session.beat and beat_line(session.beat)
+    if beats:
+        texts.append(paragraph(beats))
+    texts.append(f"<pre>{escaped(difference or 'nothing was changed')}</pre>")
+    details = (
+        f"<p>{escaped(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
+        paragraph(f"hilstar {session.hilstar}; images: {session.seen_by}"),
+    )
+    return Card("The bench file", words=texts, details=details)
+
+
+def _verdict(records: list[StepRecord]) -> Verdict:
     by = {verdict: [each.name for each in records if each.verdict == verdict] for verdict in WORDS}
     passed = f"{len(by['done'])} of {len(records)} steps passed"
-    missed = f"; not measured: {', '.join(by['skipped'])}" if by["skipped"] else ""
+    missed = ""
+    if by["skipped"]:
+        missed = f"; not measured: {', '.join(by['skipped'])}"
     if by["failed"]:
-        return banner_of(
-            "bad",
-            f"Not ready: {', '.join(by['failed'])} failed",
-            f"{passed}{missed}. Each card says what to do.",
-        )
+        headline = f"Not ready: {', '.join(by['failed'])} failed"
+        return Verdict(BAD, headline, f"{passed}{missed}. Each card says what to do.")
     if missed or len(records) < len(STEPS):
-        return banner_of("warn", "What was measured is in order", f"{passed}{missed}.")
-    return banner_of("ok", "The bench is ready", f"All {len(records)} steps passed.")
+        return Verdict(WARN, "What was measured is in order", f"{passed}{missed}.")
+    return Verdict(OK, "The bench is ready", f"All {len(records)} steps passed.")
 
 
 def _link(record: StepRecord) -> str:
-    words = f"{record.name}: {WORDS[record.verdict]}"
-    return (
-        f'<a href="#{record.name}" data-state="{STATES[record.verdict]}"><span'
-        f' class="chip">{escaped(words)}</span></a>'
-    )
+    verdict = f"{record.name}: {WORDS[record.verdict]}"
+    chip = f'<span class="chip">{escaped(verdict)}</span>'
+    return f'<a href="#{record.name}" data-state="{STATES[record.verdict]}">{chip}</a>'
 
 
-def _card(folder: Path, step: SessionStep, record: StepRecord, session: SessionFile) -> str:
+def _card(folder: Path, step: SessionStep, record: StepRecord, session: SessionFile) -> Card:
     pictures = [_picture(folder / name) for name in record.pictures]
-    return "\n".join(
-        [
-            f'<section class="card{" pictured" if pictures else ""}" id="{record.name}">',
-            f'<header data-state="{STATES[record.verdict]}">',
-            f"<h2>{escaped(step.name.capitalize())}</h2>",
-            f'<span class="chip">{WORDS[record.verdict]}</span></header><div class="words">',
-            *_words(step, record, session),
-            f"</div>{pictures[0] if pictures else ''}",
-            "<details><summary>Details</summary>",
-            *_details(record, pictures[1:]),
-            "</details></section>",
-        ]
+    figures = [(key_words(name), value) for name, value in record.figures.items()]
+    beside = figures[:MAX_FIGURES_BESIDE] if pictures else []
+    return Card(
+        title=step.name.capitalize(),
+        figure=_figure(record),
+        words=[*_words(step, record), *_figure_table(beside)],
+        picture="".join(pictures[:1]),
+        cure=_cure(step, record, session),
+        details=list(_details(record, pictures[1:], figures[len(beside) :])),
+        chip=WORDS[record.verdict],
+        state=STATES[record.verdict],
+        anchor=record.name,
     )
 
 
-def _words(step: SessionStep, record: StepRecord, session: SessionFile) -> Iterator[str]:
-    yield f'<p class="small">{escaped(step.measures)}</p>'
+def _figure(record: StepRecord) -> KeyFigure:
     number = record.number
-    if number is None:
-        absence = "no figure" if record.verdict == "done" else "not known"
-        yield f'<p class="number">\N{EM DASH}<small>{absence}</small></p>'
-    else:
-        value = measured(number.value, number.error, number.unit)
-        yield f'<p class="number">{escaped(value)}<small>{escaped(number.of)}</small></p>'
-    yield f"<p>{escaped(capital(record.line))}.</p>"
-    if record.verdict == "failed":
-        again = f"hilstar first-light {Path(session.bench).name} -o SESSION --again {record.name}"
-        yield (
-            f'<p class="note"><b>What to do:</b> {escaped(step.cure)} Then, as before:'
-            f" <code>{escaped(again)}</code></p>"
-        )
+    if number is not None:
+        return KeyFigure(measured(number.value, number.error, number.unit), number.of)
+    if record.verdict == "done":
+        return KeyFigure(DASH, "no figure")
+    return KeyFigure(DASH, "not known")
+
+
+def _words(step: SessionStep, record: StepRecord) -> Iterator[str]:
+    yield paragraph(f"{capital(record.line)}.")
     if record.changes:
-        yield (
-            "<p>Set in the bench file:"
-            f" {'; '.join(f'<code>{escaped(change.line)}</code>' for change in record.changes)}</p>"
-        )
+        lines = "; ".join(f"<code>{escaped(change.line)}</code>" for change in record.changes)
+        yield f"<p>Set in the bench file: {lines}</p>"
+    yield paragraph(step.measures, "small")
 
 
-def _details(record: StepRecord, pictures: list[str]) -> Iterator[str]:
-    yield f'<p class="small">{escaped(record.ended)}, {record.seconds:.1f} s</p>'
+def _cure(step: SessionStep, record: StepRecord, session: SessionFile) -> str:
+    """What to do about a step that failed."""
+    if record.verdict != "failed":
+        return ""
+    again = f"hilstar first-light {Path(session.bench).name} -o SESSION --again {record.name}"
+    return Markup(f"{escaped(step.cure)} Then, as before: <code>{escaped(again)}</code>")
+
+
+def _figure_table(figures: Sequence[tuple[str, object]]) -> Iterator[str]:
+    if figures:
+        yield table_of(figures)
+
+
+def _details(
+    record: StepRecord, pictures: list[str], figures: Sequence[tuple[str, object]]
+) -> Iterator[str]:
+    yield paragraph(f"{record.ended}, {record.seconds:.1f} s", "small")
     yield from pictures
-    if record.figures:
-        yield table_of(((name, value) for name, value in record.figures.items()), digits=6)
-    if record.files:
-        listed = list(record.files.items())[:MAX_FILES_LISTED]
-        more = len(record.files) - len(listed)
+    yield from _figure_table(figures)
+    listed = list(record.files.items())[:MAX_FILES_LISTED]
+    if listed:
         yield table_of((name, Markup(f"<code>{digest}</code>")) for name, digest in listed)
-        yield f'<p class="small">and {more} files more, in session.json</p>' if more else ""
+    more = len(record.files) - len(listed)
+    if more:
+        yield paragraph(f"and {more} files more, in session.json", "small")
 
 
 def _picture(path: Path) -> str:
     try:
         data = read_bytes(path, "", MAX_PICTURE_BYTES)
     except InputError as error:
-        return f"<p>{escaped(error)}</p>"
-    return picture_of(data, "svg+xml" if path.suffix == ".svg" else "png", path.stem)
+        return paragraph(error)
+    kind = "png"
+    if path.suffix == ".svg":
+        kind = "svg+xml"
+    return picture_of(data, kind, path.stem)

@@ -59,6 +59,11 @@ function drawAll() {
   for (const what of Object.keys(dirty)) dirty[what] = false;
 }
 
+function drawThemed() {
+  sky.draw();
+  drawCharts();
+}
+
 function onChange() {
   health.check();
   if (!link.open) controls.lose();
@@ -286,7 +291,7 @@ function onKey(event) {
 function start() {
   overlays.makeButtons(byId("overlays"));
   picture.setRedClipped(overlays.on.clipped);
-  startTheme(() => Object.keys(dirty).forEach(redraw));
+  startTheme(() => Object.keys(dirty).forEach(redraw), drawThemed);
   listKeys([...KEYS.map(([key, words]) => [key === key.toUpperCase() && /[A-Z]/.test(key) ? `Shift ${key}` : key.toUpperCase(), words]), ["Arrows", "Move the picture, when it has the focus"]]);
   const act = { "zoom-fit": "0", "zoom-one": "1", "zoom-pixels": "9", "zoom-in": "+", "zoom-out": "-", hold: "h", "shortcuts-open": "?" };
   for (const [id, key] of Object.entries(act)) byId(id).addEventListener("click", KEYS.find(([k]) => k === key)[2]);

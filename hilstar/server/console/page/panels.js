@@ -125,17 +125,17 @@ export function writeRefusals(refused) {
 
 export function addEvent({ utc, kind, line }, onPick = null, most = KEPT_EVENTS) {
   const list = byId("events");
-  const row = make("li", "", "");
+  const row = make("li");
   const time = make("time", "figure", utc.length > 12 ? clock(utc) : utc);
-  row.append(time, make("span", "chip", kind), make("span", "words", line));
+  const parts = [time, make("span", "chip", kind), make("span", "words", line)];
   row.dataset.kind = kind;
   if (onPick) {
-    row.classList.add("pick");
-    row.tabIndex = 0;
-    row.setAttribute("role", "button");
-    row.addEventListener("click", onPick);
-    row.addEventListener("keydown", (event) => event.key === "Enter" && onPick());
-  }
+    const button = make("button", "pick");
+    button.type = "button";
+    button.append(...parts);
+    button.addEventListener("click", onPick);
+    row.append(button);
+  } else row.append(...parts);
   list.prepend(row);
   while (list.childElementCount > most) list.lastElementChild.remove();
   write(byId("events-count"), `${list.childElementCount}`);

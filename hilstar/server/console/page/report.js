@@ -1,8 +1,7 @@
 // A run that is over, on the same page: all of it along its time, and any moment of it.
 
-import { Chart, timeText } from "./charts.js";
+import { Chart, Histogram, timeText } from "./charts.js";
 import { byId, clock, duration, fixed, make, quantity, write } from "./format.js";
-import { Histogram } from "./histogram.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
 import { Rows, addEvent, writeAttitude, writeRefusals } from "./panels.js";
 import { Picture } from "./picture.js";
@@ -367,6 +366,10 @@ function listen() {
 
 function drawAll() {
   drawPicture();
+  drawThemed();
+}
+
+function drawThemed() {
   sky.draw();
   drawCharts();
   for (const one of histograms) one.draw();
@@ -384,7 +387,7 @@ async function start() {
   if (run.sky) sky.setSky(run.sky);
   sky.trail = run.path.q.map((q) => radecRollOf(q).slice(0, 2));
   makeCharts();
-  startTheme(drawAll);
+  startTheme(drawAll, drawThemed);
   listen();
   const lit = run.pictures.findIndex((one) => one.truth);
   if (run.pictures.length) await show(Math.max(lit, 0));

@@ -27,7 +27,8 @@ export function readInks() {
   ink.theme = document.documentElement.dataset.theme;
 }
 
-export function startTheme(onChange) {
+// `onPrint` draws what has the theme's colours, and no picture: a browser prints one that is drawn just then as vectors, wrongly.
+export function startTheme(onChange, onPrint) {
   const button = byId("theme");
   let chosen = stored();
   const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -48,5 +49,12 @@ export function startTheme(onChange) {
     apply();
   });
   dark.addEventListener("change", apply);
+  // Canvases have the colours of when they were drawn: on paper, the light ones.
+  window.addEventListener("beforeprint", () => {
+    document.documentElement.dataset.theme = "light";
+    readInks();
+    onPrint();
+  });
+  window.addEventListener("afterprint", apply);
   apply();
 }

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics import charts, html_pages
+from hilstar.basics import charts, pages
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import AssessSettings, assess_files, lock_of
@@ -52,7 +52,7 @@ def by_file(
     """
     folder, drawn = tmp_path_factory.mktemp("assess"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(html_pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
+        patch.setattr(pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
         ledger, telemetry = write_run(folder, planted)
         run = run_hilstar_here(
             "assess", ledger, telemetry, "-o", folder / "out", "--json", "--display-attitudes", "0"
@@ -101,13 +101,26 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
     assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
     text = (out / "budget.html").read_text()
     titles = [
-        "Budget",
-        "Errors over the run",
-        "What repeats with the place in the field",
+        "Answers over the run",
+        "Wrong answers and outages",
+        "Bias",
+        "Field-of-view error",
+        "Pixel error",
         "Noise",
-        "By rate",
+        "Clock",
     ]
-    assert re.findall("<h2>(.*?)</h2>", text)[:5] == titles
+    assert re.findall("<h2>(.*?)</h2>", text)[:7] == titles
+    # the worst first: the verdict, then availability, wrong answers, lost locks, missed frames
+    band = re.search('<div class="health" data-state="(.*?)"><div><strong>(.*?)</strong>', text)
+    assert band is not None
+    percent = f"{100 * found['availability']:.3g} %"
+    assert band.groups() == ("bad", f"The tracker was right in {percent} of the answers due")
+    figures = re.findall('<p class="number" data-state="(.*?)">(.*?)<small>(.*?)</small>', text)
+    assert figures[0][:2] == ("warn", percent)
+    assert figures[1] == ("bad", "5", "wrong answers")
+    assert figures[2][2] == "lost locks"
+    assert figures[3] == ("ok", "0", "missed frames")
+    assert "+-" not in text
     assert (
         text.count("data:image/svg+xml;base64,") == len(drawn) == 3
         and "prefers-color-scheme: dark" in text

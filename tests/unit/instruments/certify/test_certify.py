@@ -424,7 +424,11 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     figure = next(each for each in found["figures"] if each["quantity"] == "latency")
     assert figure["lower"] < figure["value"] < figure["upper"]
     assert figure["contributions"][0]["input"] == "delay"
-    assert (tmp_path / "out" / "index.html").read_text().count("<h2>") > 4
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert page.count("<h2>") > 4
+    assert "<strong>Does not conform: " in page
+    assert "star&#x27;s place along x" in page and "<td>place_along</td>" not in page
+    assert ">-</td>" not in page and ">unlimited</td>" not in page
     assert run_hilstar_here(*words).returncode == 2
     assert run_hilstar_here(*words, "--check").returncode == 0
     plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6))

@@ -25,6 +25,10 @@ from tests.support.run_page import run_data_of
 
 PERIOD_NS = 16_666_667
 MAX_PAGE_BYTES = 3_000_000  # "a few MB", without pictures
+UPLOT_SHA256 = {
+    "uplot.min.js": "19c8d4c6ad88929a79f4ae49d6f7161566dfd0ba3d15cc495e974f787eb78f1f",
+    "uplot.min.css": "df630c6a8d6f8eeaff264b50f73ce5b114f646ffd9a0bb74f049b0a00135fa04",
+}
 FRAMES = 32_000  # nearly as many spans as there may be, of 4 frames each
 
 
@@ -68,18 +72,34 @@ def test_the_page_stands_alone_and_lets_nothing_else_in(run):
     page = report_page(run_data("run.mcap", run, summarise(run)))
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
     script = re.search(r'<script type="module">(.*?)</script>', page, re.DOTALL)
+    uplot = re.search(r"<script>(.*?)</script>", page, re.DOTALL)
     style = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
-    assert policy is not None and script is not None and style is not None
+    assert policy is not None and script is not None and style is not None and uplot is not None
+    assert page.count("<script") == 3  # the run's data among them
     assert "default-src 'none'" in policy[1]
-    for kind, text in (("script", script[1]), ("style", style[1])):
-        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        assert f"{kind}-src 'sha256-{digest}'" in policy[1]
+    scripts = f"script-src {sha256_source(uplot[1])} {sha256_source(script[1])};"
+    assert scripts in policy[1]
+    assert f"style-src {sha256_source(style[1])};" in policy[1]
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
-    assert (
-        not re.search(r"https?://(?!www\.w3\.org)", page.replace(script[1], ""))
-        and "fetch(" not in script[1]
-    )
+    rest = page.replace(script[1], "").replace(uplot[1], "")
+    assert not re.search(r"https?://(?!www\.w3\.org)", rest)
+    for text in (script[1], uplot[1]):
+        assert not re.search(r"fetch\(|XMLHttpRequest|WebSocket|import\(|eval\(|new Function", text)
     assert run_data_of(page)["bench_text"] == "</script>"
+
+
+def sha256_source(text: str) -> str:
+    """A script's or a style's source in a policy."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def test_uplot_is_the_published_file_and_ships_with_its_licence():
+    """npm's uplot 1.6.32: dist/uPlot.iife.min.js and dist/uPlot.min.css, byte for byte."""
+    for name, digest in UPLOT_SHA256.items():
+        assert hashlib.sha256((PAGE_DIR / name).read_bytes()).hexdigest() == digest
+    licence = (PAGE_DIR / "uplot.LICENSE").read_text()
+    assert licence.startswith("The MIT License (MIT)")
+    assert "Leon Sorokin" in licence
 
 
 def test_every_module_of_the_page_can_be_taken_into_it():

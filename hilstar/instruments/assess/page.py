@@ -1,0 +1,401 @@
+"""The page of an assessment, budget.html: whether the tracker was right, its errors in a card
+each, and what to do.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, INK, MUTED, RED, label_ends, panels_of
+from hilstar.basics.files import write_whole
+from hilstar.basics.pages import (
+    BAD,
+    DASH,
+    OK,
+    WARN,
+    Card,
+    KeyFigure,
+    Verdict,
+    details_of,
+    drawing_of,
+    figures_of,
+    list_of,
+    measured,
+    page_of,
+    paragraph,
+    table_of,
+    within,
+)
+from hilstar.basics.rotation import to_matrix
+from hilstar.instruments.assess.assessment import Assessment
+from hilstar.instruments.assess.bench_effects import Slice
+from hilstar.instruments.assess.budget import Axes
+from hilstar.instruments.assess.report import (
+    COUNT,
+    bench_text,
+    display_text,
+    limit_text,
+    lines_of,
+    rows_of,
+)
+
+AVAILABLE = 0.99  # a smaller availability is a warning
+MAX_POINTS = 4000
+MAX_ROWS = 200
+WRONG_HEIGHT = 0.96  # of the marks of wrong answers, in the panel
+AXES = ("x", "y", "about the boresight")
+ARCSEC = "arcsec"
+WRONG_CURE = "Look at these moments in the run's report, and at these rows of the telemetry."
+LOST_CURE = "Compare the times of the outages with the run's rates, faults and missed frames."
+MISSED_CURE = "See why frames were missed under Pacing in the run's report."
+STILL_CURE = "To measure the clock, assess a run that turns at changing rates."
+YES = {True: "yes", False: ""}
+WRONG_COLUMNS = ("row", "telemetry's time, s", "run time, s", "off by, deg")
+OUTAGE_COLUMNS = ("run time, s", "length, s", "lock lost", "rows", "wrong")
+SLICE_COLUMNS = (
+    "answers",
+    "noise across, arcsec",
+    "noise about the boresight, arcsec",
+    "rms across, arcsec",
+    "rms about the boresight, arcsec",
+)
+
+
+def write_page(path: Path, found: Assessment) -> None:
+    """Write the page of an assessment as one file that needs no other. Raises InputError."""
+    cards = [
+        _answers(found),
+        *_events(found),
+        *_errors(found),
+        _clock(found),
+        *_beside(found),
+        *_slices(found),
+    ]
+    parts = [figures_of(_counts(found)), *(card.html() for card in cards)]
+    parts.append(_whole_budget(found))
+    if found.notes:
+        parts.append(Card("Notes", words=[list_of(found.notes)]).html())
+    title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
+    write_whole(path, page_of(title, verdict_of(found), parts))
+
+
+def verdict_of(found: Assessment) -> Verdict:
+    """Whether the tracker was right throughout: BAD with wrong answers or lost locks, WARN with
+    missed frames or an availability under AVAILABLE.
+    """
+    wrong, lost, missed = len(found.wrong), len(found.lock.lost), found.run.run.missed
+    counts = ", ".join(
+        (
+            _counted(wrong, "wrong answer"),
+            _counted(lost, "lost lock"),
+            _counted(missed, "missed frame"),
+        )
+    )
+    headline = f"The tracker was right in {_percent(found)} of the answers due"
+    if wrong or lost:
+        return Verdict(BAD, headline, f"{counts}.")
+    if missed or found.lock.availability < AVAILABLE:
+        return Verdict(WARN, headline, f"{counts}.")
+    return Verdict(OK, headline, f"{counts}.")
+
+
+def _counted(count: int, noun: str) -> str:
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count or 'no'} {noun}s"
+
+
+def _percent(found: Assessment) -> str:
+    """The availability; only all of the answers due are 100 %."""
+    lock = found.lock
+    if lock.right >= lock.due:
+        return "100 %"
+    return f"{min(100 * lock.availability, 99.99):.3g} %"
+
+
+def _counts(found: Assessment) -> Iterator[KeyFigure]:
+    """Availability, wrong answers, lost locks, missed frames."""
+    lock = found.lock
+    state = OK
+    if lock.availability < AVAILABLE:
+        state = WARN
+    cycle = f"availability: {lock.right} of {lock.due} answers due"
+    yield KeyFigure(_percent(found), f"{cycle}, one each {1e3 * lock.cycle_s:.4g} ms", state)
+    yield _count(len(found.wrong), "wrong answers", BAD)
+    yield _count(len(lock.lost), "lost locks", BAD)
+    yield _count(found.run.run.missed, "missed frames", WARN)
+
+
+def _count(count: int, of: str, state: str) -> KeyFigure:
+    if count:
+        return KeyFigure(str(count), of, state)
+    return KeyFigure("0", of, OK)
+
+
+def _answers(found: Assessment) -> Card:
+    """The answers over the run, with each wrong one and each outage."""
+    lines = dict(lines_of(found))
+    rows = [
+        ("answers", lines["answers"]),
+        ("acquisition", lines["acquisition"]),
+        ("missed frames", lines["missed frames"]),
+        ("wrong", lines["wrong"]),
+    ]
+    causes = (
+        (found.wrong, WRONG_CURE),
+        (found.lock.lost, LOST_CURE),
+        (found.run.run.missed, MISSED_CURE),
+    )
+    cures = [cure for count, cure in causes if count]
+    return Card(
+        "Answers over the run",
+        words=[table_of(rows)],
+        picture=_over_time(found),
+        cure=" ".join(cures),
+    )
+
+
+def _events(found: Assessment) -> Iterator[Card]:
+    """The wrong answers and the outages, folded on the screen."""
+    parts = []
+    if found.wrong:
+        wrong = [astuple(each) for each in found.wrong[:MAX_ROWS]]
+        table = table_of(wrong, WRONG_COLUMNS)
+        parts.append(details_of(f"{len(found.wrong)} wrong answers", table, printed=True))
+    outages = found.lock.outages
+    if outages:
+        rows = [
+            (outage.start_s, outage.length_s, YES[outage.lost], outage.rows, outage.wrong)
+            for outage in outages[:MAX_ROWS]
+        ]
+        table = table_of(rows, OUTAGE_COLUMNS)
+        parts.append(details_of(f"{len(outages)} outages", table, printed=True))
+    if parts:
+        yield Card("Wrong answers and outages", words=parts)
+
+
+def _errors(found: Assessment) -> Iterator[Card]:
+    """Bias, field-of-view error, pixel error and noise, one sigma an axis."""
+    parts = found.found
+    intervals, pixel = parts.intervals, parts.components.pixel
+    low, high = intervals.bias
+    cross, half = parts.bias_arcsec[:2], (high[:2] - low[:2]) / 2
+    across = float(np.hypot(*cross))
+    off = float(np.hypot(*(cross * half))) / max(across, 1e-12)  # to first order
+    biases = [
+        (axis, within(float(parts.bias_arcsec[k]), float(low[k]), float(high[k]), ARCSEC))
+        for k, axis in enumerate(AXES)
+    ]
+    texts = [table_of(biases), paragraph("95 % intervals in brackets, by the block bootstrap.")]
+    bias = KeyFigure(
+        measured(across, off, ARCSEC),
+        "constant turn across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
+    )
+    yield Card("Bias", bias, texts)
+    picture, reason = _field_map(found)
+    texts = _about(parts.fov_arcsec, intervals.fov)
+    if reason:
+        texts.append(paragraph(f"{reason}.", "small"))
+    figure = _across(parts.fov_arcsec, intervals.fov)
+    yield Card("Field-of-view error", figure, texts, picture)
+    texts = _about(parts.pixel_arcsec, intervals.pixel)
+    texts.append(paragraph(f"{pixel.detail or pixel.reason}.", "small"))
+    yield Card("Pixel error", _across(parts.pixel_arcsec, intervals.pixel), texts)
+    texts = _about(found.noise_arcsec, intervals.noise)
+    texts.append(paragraph(f"Limit of the tracker's stars: {limit_text(found.limit_arcsec)}."))
+    figure = _across(found.noise_arcsec, intervals.noise)
+    yield Card("Noise", figure, texts, _histogram(found))
+
+
+def _across(axes: Axes, interval: FloatArray) -> KeyFigure:
+    """A part of the budget across the boresight, with its 95 % interval (2, 2)."""
+    if axes.cross is None:
+        return KeyFigure(DASH, "cannot be told")
+    low, high = interval[:, 0].tolist()
+    half = (high - low) / 2
+    return KeyFigure(
+        measured(axes.cross, half, ARCSEC),
+        "one sigma across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
+    )
+
+
+def _about(axes: Axes, interval: FloatArray) -> list[str]:
+    """A part of the budget about the boresight, with its 95 % interval (2, 2)."""
+    if axes.roll is None:
+        return []
+    low, high = interval[:, 1].tolist()
+    return [paragraph(f"About the boresight: {within(axes.roll, low, high, ARCSEC)}.")]
+
+
+def _clock(found: Assessment) -> Card:
+    """The tracker's clock against the run's."""
+    clock = found.found.clock
+    if not clock.offset_told:
+        return Card("Clock", KeyFigure(DASH, "the run does not turn enough"), cure=STILL_CURE)
+    offset = measured(1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms")
+    drift = "Its rate cannot be told: the run does not turn enough."
+    if clock.drift_told:
+        rate = measured(1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm")
+        drift = f"It is fast by {rate}."
+    figure = KeyFigure(offset, "tracker's clock minus the run's, at the run's start")
+    return Card("Clock", figure, [paragraph(drift)])
+
+
+def _beside(found: Assessment) -> Iterator[Card]:
+    """What of the errors is not the tracker's: the display's, the bench's, the glass's."""
+    rows = [("display", display_text(found.display))]
+    if found.certificate is not None:
+        rows.append(("bench", bench_text(found)))
+    if found.glass is not None:
+        rows.append(("glass", found.glass.line()))
+    yield Card("What is not the tracker's", words=[table_of(rows)])
+
+
+def _slices(found: Assessment) -> Iterator[Card]:
+    """The errors by rate and by magnitude."""
+    for name, unit, slices in (
+        ("rate", "deg/s", found.by_rate),
+        ("magnitude of the field", "V mag", found.by_magnitude),
+    ):
+        if slices:
+            yield Card(f"By {name}", words=_slice_table(unit, slices))
+
+
+def _slice_table(unit: str, slices: Sequence[Slice]) -> list[str]:
+    header = (f"from, {unit}", f"to, {unit}", *SLICE_COLUMNS)
+    rows = [astuple(each) for each in slices]
+    return [table_of(rows, header, 3), paragraph("The rms is about the bias.", "small")]
+
+
+def _whole_budget(found: Assessment) -> str:
+    """The rows of budget.csv."""
+    rows = []
+    for row in rows_of(found):
+        unit = "" if row.unit == COUNT else row.unit
+        rows.append((row.quantity, row.axis, row.value, unit, row.low_95, row.high_95))
+    header = ("quantity", "axis", "value", "unit", "from", "to")
+    note = paragraph("One sigma an axis, with 95 % intervals by the block bootstrap.")
+    return Card("Budget", words=[note, table_of(rows, header)]).html()
+
+
+def _over_time(found: Assessment) -> str:
+    """The errors along the run, with what repeats, lost locks and wrong answers."""
+    parts = found.found.components
+    valid = np.flatnonzero(found.telemetry.valid)
+    t_s = found.t_s[valid[found.found.row]]
+    some = np.unique(np.linspace(0, len(t_s) - 1, MAX_POINTS).astype(int))
+    wrong_s = np.array([each.run_s for each in found.wrong])
+    repeating = parts.fov.fitted + parts.pixel.fitted
+    rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
+    finding = (
+        f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g}"
+        " about the boresight"
+    )
+    note = (
+        "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost."
+        " Red marks: wrong answers."
+    )
+    with panels_of(finding, 3, note=note, height_inch=7.0) as panels:
+        for axes, name, k in zip(panels, AXES, range(3), strict=True):
+            axes.plot(
+                t_s[some],
+                (repeating + parts.left)[some, k],
+                ".",
+                ms=3.5,
+                color=MUTED,
+                rasterized=True,
+            )
+            axes.plot(
+                t_s[some],
+                parts.fov.fitted[some, k],
+                ".",
+                ms=2.5,
+                color=BLUE,
+                rasterized=True,
+                label="repeats",
+            )
+            for each in found.lock.lost:
+                axes.axvspan(
+                    each.start_s, each.start_s + each.length_s, color=MUTED, alpha=0.15, lw=0
+                )
+            if found.wrong:
+                height, place = np.full(len(wrong_s), WRONG_HEIGHT), axes.get_xaxis_transform()
+                axes.scatter(wrong_s, height, 25, RED, marker="v", transform=place)
+            axes.set_ylabel(f"{name} [arcsec]")
+            label_ends(axes)
+        panels[-1].set_xlabel("run time [s]")
+    return drawing_of(panels[0].figure, "errors over the run")
+
+
+def _field_map(found: Assessment) -> tuple[str, str]:
+    """The map of the field-of-view error, and why there is none."""
+    parts, scale = found.found.components, found.run.scale
+    axes = to_matrix(found.found.commanded_q)
+    some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
+    mean = axes[:, 2].mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    seen = axes[some] @ (mean / max(size, 1e-9))
+    if parts.fov.reason or seen[:, 2].min() < 0.3:
+        reason = (
+            parts.fov.reason
+            or "the run goes over too much of the sky for one map: see the chart over time"
+        )
+        return "", f"no map: {reason}"
+    place = scale.focal_px * seen[:, :2] / seen[:, 2:]
+    largest = np.abs(parts.fov.fitted).max(axis=0)
+    finding = (
+        f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g}"
+        " about the boresight"
+    )
+    with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
+        for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
+            value, limit = parts.fov.fitted[some, k], max(float(largest[k]), 1e-6)
+            look: dict[str, Any] = {
+                "cmap": "RdBu_r",
+                "vmin": -limit,
+                "vmax": limit,
+                "rasterized": True,
+            }
+            drawn = panel.scatter(place[:, 0], place[:, 1], c=value, s=6, edgecolors="none", **look)
+            panel.figure.colorbar(
+                drawn, ax=panel, orientation="horizontal", label=f"{name} [arcsec]"
+            )
+            panel.set_aspect("equal", adjustable="datalim")
+            panel.set_xlabel("star field x [px]")
+            panel.invert_yaxis()
+        panels[0].set_ylabel("star field y [px]")
+    return drawing_of(panels[0].figure, "field-of-view error over the field"), ""
+
+
+def _histogram(found: Assessment) -> str:
+    """What is left as noise, beside the normal distribution."""
+    left, variance = found.found.components.left, found.found.components.noise_variance
+    sigmas = np.sqrt(variance)
+    finding = (
+        f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the"
+        " boresight, one sigma"
+    )
+    note = (
+        "Bars: what is left when all that repeats is taken away. Line: the normal distribution of"
+        " that sigma."
+    )
+    with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.6) as panels:
+        for k, (axes, name) in enumerate(zip(panels, AXES, strict=True)):
+            sigma = max(float(sigmas[k]), 1e-9)
+            edges = np.linspace(-5, 5, 61) * sigma
+            axes.hist(left[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
+            axes.plot(
+                edges,
+                np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),
+                color=INK,
+                lw=1.2,
+            )
+            axes.set_yscale("log")
+            axes.set_ylim(1e-6 / sigma, 1 / sigma)
+            axes.set_xlabel(f"{name} [arcsec]")
+        panels[0].set_ylabel("share [1/arcsec]")
+    return drawing_of(panels[0].figure, "noise, and the normal distribution")

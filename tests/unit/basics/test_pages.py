@@ -1,0 +1,137 @@
+"""The builder of pages: landmarks, verdicts, figures with their uncertainty, tables, themes."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from hilstar.basics.pages import (
+    BAD,
+    OK,
+    Card,
+    KeyFigure,
+    Markup,
+    Verdict,
+    details_of,
+    escaped,
+    figures_of,
+    key_words,
+    measured,
+    page_of,
+    page_style,
+    table_of,
+    within,
+)
+from hilstar.basics.palette import colours_of
+
+PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
+
+
+def rows_of(table: str) -> list[list[str]]:
+    """The texts of a table's cells."""
+    rows = re.findall("<tr>(.*?)</tr>", table)
+    return [re.findall("<t[hd][^>]*>(.*?)</t[hd]>", row) for row in rows]
+
+
+def test_a_page_has_its_verdict_first_in_its_only_main_landmark() -> None:
+    card = Card("Noise", KeyFigure("1.0 arcsec", "one sigma"), words=["<p>words</p>"])
+    page = page_of("a < b", Verdict(BAD, "Not ready", "x & y"), [card.html()], "go();").decode()
+    assert page.count("<main>") == page.count("</main>") == page.count("<h1>") == 1
+    assert "<title>a &lt; b</title>" in page
+    main = page[page.index("<main>") : page.index("</main>")]
+    places = [main.index(each) for each in ("<h1>", 'data-state="bad"', "<h2>Noise</h2>")]
+    assert places == sorted(places)
+    assert "x &amp; y" in main
+    assert "<script>go();</script>" not in main
+    assert page.endswith("<script>go();</script>\n</body></html>\n")
+
+
+def test_a_card_says_what_to_do_and_folds_its_details() -> None:
+    plain = Card("Focus").html()
+    assert "What to do" not in plain and "<details" not in plain and "pictured" not in plain
+    card = Card(
+        "Focus",
+        picture="<figure></figure>",
+        cure="Turn the lens.",
+        details=["<p>more</p>"],
+        chip="failed",
+        state=BAD,
+        anchor="focus",
+    ).html()
+    assert '<section class="card pictured" id="focus">' in card
+    assert "<b>What to do:</b> Turn the lens." in card
+    assert "<details><summary>Details</summary><p>more</p></details>" in card
+    assert 'data-state="bad"><h2>Focus</h2><span class="chip">failed</span>' in card
+    assert '<details class="printed">' in details_of("Events", "<p>1</p>", printed=True)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "unit", "text"),
+    [
+        (1.23456, 0.0123, "px", f"1.235 {PLUS_MINUS} 0.012 px"),
+        (-130.89, 108.63, "%", f"-130 {PLUS_MINUS} 110 %"),
+        (12345.6, 12.3, "", f"12\u202f346 {PLUS_MINUS} 12"),
+        (-0.0004, 0.5, "ms", f"0.00 {PLUS_MINUS} 0.50 ms"),
+        (3.14159, None, "s", "3.142 s"),
+        (3.14159, float("nan"), "s", "3.142 s"),
+    ],
+)
+def test_a_figure_has_two_digits_of_its_uncertainty(value, error, unit, text) -> None:
+    assert measured(value, error, unit) == text
+
+
+def test_an_interval_has_two_digits_of_its_half_width() -> None:
+    assert within(1.6471, 1.4043, 1.8941, "arcsec") == "1.65 (1.40 to 1.89) arcsec"
+    assert within(2.0, 2.0, 2.0) == "2"
+
+
+def test_a_table_leaves_out_columns_without_a_value_and_writes_no_dashes() -> None:
+    rows = [("flux", 1.23456, None, ""), ("place", 7, None, "")]
+    table = table_of(rows, ("quantity", "value", "limit", "verdict"))
+    assert rows_of(table) == [["quantity", "value"], ["flux", "1.235"], ["place", "7"]]
+    assert '<th scope="col">' in table
+    some = table_of([("flux", None), ("place", 0.1)], ("quantity", "limit"))
+    assert rows_of(some)[1:] == [["flux", ""], ["place", "0.1"]]
+    assert rows_of(table_of([("a", None)])) == [["a", ""]]  # without a header, all of it
+
+
+def test_a_cell_with_an_uncertainty_stands_with_the_numbers_and_a_sentence_does_not() -> None:
+    table = table_of([("1.0 +- 0.1 px", Markup("<b>x</b>"), f"{'word ' * 9}+- 1")])
+    assert f'<td class="n">1.0 {PLUS_MINUS} 0.1 px</td><td><b>x</b></td><td>word' in table
+
+
+def test_text_is_escaped_and_an_uncertainty_has_its_sign() -> None:
+    assert escaped("<b> 3 +- 1") == f"&lt;b&gt; 3 {PLUS_MINUS} 1"
+    assert escaped(Markup("<b>")) == "<b>"
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("drift_error_percent_per_h", "drift error, %/h"),
+        ("panel_delay_ms", "panel delay, ms"),
+        ("bits", "bits"),
+        ("max_cd_m2", "max, cd/m\N{SUPERSCRIPT TWO}"),
+    ],
+)
+def test_a_key_reads_as_words_and_a_unit(key, words) -> None:
+    assert key_words(key) == words
+
+
+def test_figures_have_their_state() -> None:
+    tiles = figures_of([KeyFigure("0", "wrong answers", OK), KeyFigure("3", "lost locks", BAD)])
+    assert re.findall('data-state="(.*?)">(.)', tiles) == [("ok", "0"), ("bad", "3")]
+
+
+def test_a_page_is_light_on_paper_whatever_the_reader_prefers() -> None:
+    style = page_style()
+    root, rest = style.split("\n", 1)
+    assert all(f"--{name}: {colour};" in root for name, colour in colours_of("light").items())
+    dark = f"--ground: {colours_of('dark')['ground']};"
+    at = rest.index(dark)
+    assert rest.rindex("@media", 0, at) == rest.index(
+        "@media screen and (prefers-color-scheme: dark)"
+    )
+    assert rest.count(dark) == 1
+    assert "@media print { :root { color-scheme: light } }" in style

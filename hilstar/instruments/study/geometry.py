@@ -260,7 +260,8 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 def frames_of(quick: bool) -> list[Frames]:
     """The sets of frames that are measured: usual noise by size, and the usual size by noise."""
-    sizes, noises = SIZES, NOISES_PX
+    sizes: tuple[tuple[int, int], ...] = SIZES
+    noises: tuple[float, ...] = NOISES_PX
     if quick:
         sizes, noises = SIZES[1:4:2], (USUAL_NOISE_PX, NOISES_PX[-1])
     by_size = {Frames(*size, USUAL_NOISE_PX) for size in sizes}

@@ -18,14 +18,14 @@ from hilstar.instruments.study.sweep import Load
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
 
 Value = str | Callable[[Any], float]
 Where = Callable[[Any], bool]
 Scale = Literal["linear", "log", "symlog"]
 HIDDEN = "_"  # matplotlib names no line whose label begins so
 LEVEL_WIDTH = 1.2
-SYMLOG_FROM = 1.0  # the half width of a symlog axis's linear part
+# The half width of a symlog axis's linear part.
+SCALE_KEYWORDS: dict[str, dict[str, Any]] = {"symlog": {"linthresh": 1.0}}
 IDLE = Load()
 
 
@@ -148,8 +148,8 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
         style = {"color": level.colour, "ls": level.style, "lw": level.width}
         axes.axhline(level.at, label=level.label, **style)
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel, title=panel.title)
-    set_scale(axes.xaxis, panel.scales[0])
-    set_scale(axes.yaxis, panel.scales[1])
+    axes.set_xscale(panel.scales[0], **SCALE_KEYWORDS.get(panel.scales[0], {}))
+    axes.set_yscale(panel.scales[1], **SCALE_KEYWORDS.get(panel.scales[1], {}))
     if panel.from_zero:
         axes.set_ylim(bottom=0)
     if panel.xticks:
@@ -160,16 +160,6 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
         axes.legend(**panel.legend)
     elif panel.names:
         label_ends(axes)
-
-
-def set_scale(axis: "Axis", scale: Scale) -> None:
-    """Make an axis logarithmic, or linear only about 0."""
-    keywords: dict[str, float] = {"linthresh": SYMLOG_FROM} if scale == "symlog" else {}
-    axes: Any = axis.axes
-    if axis.axis_name == "x":
-        axes.set_xscale(scale, **keywords)
-    else:
-        axes.set_yscale(scale, **keywords)
 
 
 def draw_line(axes: "Axes", line: LineSpec, look: SeriesLook, series: Sequence[Any]) -> None:

@@ -145,7 +145,7 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
         for line in panel.lines:
             draw_line(axes, line, look, series)
     for level in panel.levels:
-        style = {"color": level.colour, "ls": level.style, "lw": level.width}
+        style: dict[str, Any] = {"color": level.colour, "ls": level.style, "lw": level.width}
         axes.axhline(level.at, label=level.label, **style)
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel, title=panel.title)
     axes.set_xscale(panel.scales[0], **SCALE_KEYWORDS.get(panel.scales[0], {}))

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from hilstar.basics.charts import INK, SERIES, chart, label_ends, plain_ticks
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import INK, SERIES, chart, label_ends, plain_ticks, write_csv
 from hilstar.instruments.study.sweep import Load
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ class PanelSpec:
     title: str = ""
     levels: tuple[LevelLine, ...] = ()
     scales: tuple[Scale, Scale] = ("linear", "linear")
+    xlim: tuple[float, float] | None = None
     xticks: Sequence[float] = ()
     yticks: Sequence[float] = ()
     from_zero: bool = False
@@ -103,6 +105,20 @@ class ChartSpec:
     note: str = ""
     columns: int = 1
     layout: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePanel:
+    """Curves (n,) by their names against one x (n,); `spec` has the labels, scales and ticks.
+
+    `colours` are SERIES's where none are given, `look` the keywords of every line.
+    """
+
+    x: FloatArray
+    curves: Mapping[str, FloatArray]
+    spec: PanelSpec
+    colours: tuple[str, ...] = ()
+    look: Mapping[str, Any] = field(default_factory=dict)
 
 
 def looks_of(labels: Mapping[Any, str], markers: str = "") -> dict[Any, SeriesLook]:
@@ -144,12 +160,19 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
         series = [row for row in rows if spec.by(row) == key]
         for line in panel.lines:
             draw_line(axes, line, look, series)
+    finish_panel(axes, panel)
+
+
+def finish_panel(axes: "Axes", panel: PanelSpec) -> None:
+    """Draw a panel's levels, and set its labels, scales, ticks and names."""
     for level in panel.levels:
         style: dict[str, Any] = {"color": level.colour, "ls": level.style, "lw": level.width}
         axes.axhline(level.at, label=level.label, **style)
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel, title=panel.title)
     axes.set_xscale(panel.scales[0], **SCALE_KEYWORDS.get(panel.scales[0], {}))
     axes.set_yscale(panel.scales[1], **SCALE_KEYWORDS.get(panel.scales[1], {}))
+    if panel.xlim is not None:
+        axes.set_xlim(panel.xlim)
     if panel.from_zero:
         axes.set_ylim(bottom=0)
     if panel.xticks:
@@ -160,6 +183,36 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
         axes.legend(**panel.legend)
     elif panel.names:
         label_ends(axes)
+
+
+def draw_curves(path: Path, finding: str, panels: Sequence[CurvePanel], note: str = "") -> None:
+    """Draw curves whose x is the same for all of a panel, one panel above the other. Raises
+    InputError where it cannot be written.
+    """
+    share_x = all(panel.x is panels[0].x for panel in panels)
+    with chart(path, finding, len(panels), note=note, share_x=share_x) as grid:
+        for axes, panel in zip(grid, panels, strict=True):
+            draw_curve_panel(axes, panel)
+
+
+def draw_curve_panel(axes: "Axes", panel: CurvePanel) -> None:
+    """Draw the curves of one panel."""
+    colours = panel.colours or SERIES
+    for (name, values_y), colour in zip(panel.curves.items(), colours, strict=False):
+        axes.plot(panel.x, values_y, color=colour, label=name, **panel.look)
+    finish_panel(axes, panel.spec)
+
+
+def columns_of(tables: Mapping[str, FloatArray]) -> list[list[float]]:
+    """The rows of a table by its columns (n,)."""
+    return np.column_stack(list(tables.values())).tolist()  # type: ignore[no-any-return]
+
+
+def write_columns(path: Path, tables: Mapping[str, FloatArray]) -> None:
+    """Write columns (n,) by their names as a table. Raises InputError where it cannot be
+    written.
+    """
+    write_csv(path, list(tables), columns_of(tables))
 
 
 def draw_line(axes: "Axes", line: LineSpec, look: SeriesLook, series: Sequence[Any]) -> None:

@@ -13,9 +13,9 @@ from typing import Any, get_type_hints
 
 from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, value_bars
 from hilstar.instruments.study import codes, colour, timing
-from hilstar.instruments.study.sweep import Figure, Load, Trial, Trials
-from hilstar.instruments.study.tradeoff import run as tradeoff
+from hilstar.instruments.study.sweep import Load
 from hilstar.instruments.study.tradeoff.light import ROUNDING_MAG
+from hilstar.instruments.study.trials import Figure, Trial, Trials, draw_trials
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
@@ -183,4 +183,4 @@ if __name__ == "__main__":
         DOCS / "stripes.svg", read_records(HERE / "stripes.csv", timing.StripePoint)
     )
     codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))
-    tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)
+    draw_trials(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

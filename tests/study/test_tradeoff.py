@@ -16,20 +16,19 @@ from hilstar.display.render.reference import linear_image
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field
-from hilstar.instruments.study.sweep import (
-    MAX_ROUNDS,
-    MIN_ROUNDS,
-    Figure,
-    Trial,
-    Trials,
-    in_turn,
-    measured,
-    pareto_front,
-)
+from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
 from hilstar.instruments.study.tradeoff import run as tradeoff
 from hilstar.instruments.study.tradeoff.light import LIMITS_V_MAG, trapezoid
 from hilstar.instruments.study.tradeoff.places import SPRITE_PSF
-from hilstar.instruments.study.tradeoff.run import STEPS, draw, table_lines
+from hilstar.instruments.study.tradeoff.run import STEPS
+from hilstar.instruments.study.trials import (
+    Figure,
+    Trial,
+    Trials,
+    draw_trials,
+    measured,
+    table_lines,
+)
 from hilstar.optics.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
@@ -290,4 +289,4 @@ def test_a_trapezoid_integrates_a_straight_line(rng):
 def test_every_step_is_known_and_a_chart_that_cannot_be_written_is_refused(tmp_path, clock):
     assert len(STEPS) == len(NAMES)
     with pytest.raises(InputError, match="cannot be written"):
-        draw(tmp_path / "no" / "chart.png", measured(planted(clock, 4.0), 0.01), "here")
+        draw_trials(tmp_path / "no" / "chart.png", measured(planted(clock, 4.0), 0.01), "here")

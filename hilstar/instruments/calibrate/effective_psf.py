@@ -10,7 +10,6 @@ held out of the fit say how right both are, and whether the data ask for more th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,20 +29,32 @@ from hilstar.instruments.calibrate.geometric.fit import MatchedDots
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import measure_images, numbered, read_image
 from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of
+from hilstar.optics.psf_fit import (
+    MAX_STEP_PX,
+    MIN_VARIANCE_PX2,
+    SMALLEST,
+    XY,
+    PixelGaussians,
+    PointGaussians,
+    PointImages,
+    amplitudes,
+    fit_each,
+    over_field,
+    place_terms,
+)
 from hilstar.server.bench.bench_file import BenchFile
 
 MAX_HALF_PX, MIN_HALF_PX = 12, 4
 # a ring about the dots is light above so many sigmas, and so much of the middle's
 SEEN_SIGMAS, SEEN_SHARE = 3.0, 3e-4
-NODES = 9  # quadrature over dot and pixel, along each axis
+FIRST_COVARIANCE_PX2 = (0.5, 0.5, 0.0)
 KNOT_PX = 0.5
 PRIOR_SHARE = 0.03  # sigma of a spline's coefficient, share of a dot's light in a pixel
 MAX_DEGREE = 2  # polynomials over the field
 DOTS_A_TERM = 5
 FOLDS = 4
-FIT_ROUNDS, PLACE_ROUNDS, SPLINE_ROUNDS, SPLINE_STEPS = 8, 1, 2, 90
-STEP_PX, STEP_PX2 = 1e-3, 1e-3  # for numerical derivatives
-MIN_VARIANCE_PX2 = 0.15**2
+PLACE_ROUNDS, SPLINE_ROUNDS, SPLINE_STEPS = 1, 2, 90
+STEP_PX = 1e-3  # for numerical derivatives
 QUANTISED_DN2 = 1 / 12
 ASKS_SIGMAS = 3.0  # by which held-out dots have to prefer the spline
 POINTS = 5  # field points along each side of the file
@@ -99,11 +110,12 @@ class Effective:
         """Shares (n, h, w) of pixels at offsets (n, w), (n, h) from squares of `side_px` (n,), 0
         or more, at places (n,).
         """
-        found = gaussians(*offsets, self._of(x_px, y_px, self.covariance), side_px)
+        covariance = self._of(x_px, y_px, self.covariance)
+        shares = PixelGaussians(*offsets, covariance, side_px).shares
         if len(self.spline):
             across, down = (_functions(self.knots_px, off, side_px) for off in offsets)
-            found += down @ self._of(x_px, y_px, self.spline) @ across.transpose(0, 2, 1)
-        return found
+            shares += down @ self._of(x_px, y_px, self.spline) @ across.transpose(0, 2, 1)
+        return shares
 
     def _of(self, x_px: FloatArray, y_px: FloatArray, coefficients: FloatArray) -> FloatArray:
         place = (np.stack([x_px, y_px], axis=1) - self.middle_px) / self.scale_px
@@ -111,56 +123,8 @@ class Effective:
 
 
 def terms_of(place: FloatArray, count: int) -> FloatArray:
-    """The first terms (n, count) of polynomials of scaled places (n, 2): 1, 3 or 6 of them."""
-    x, y = place.T
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y][:count], axis=1)
-
-
-@lru_cache(maxsize=1024)
-def _quadrature(side_px: float) -> tuple[FloatArray, FloatArray]:
-    """Gauss's nodes and weights for a pixel convolved with a square's side (Golub and Welsch
-    1969).
-    """
-    at = (np.arange(600) + 0.5) / 600 * (1 + side_px) - (1 + side_px) / 2
-    weight = np.clip((1 + side_px) / 2 - np.abs(at), 0, min(1.0, side_px) or 1.0)
-    if side_px == 0:
-        weight = np.ones_like(at)
-    weight /= weight.sum()
-    before, now, norm = np.zeros_like(at), np.ones_like(at), 1.0
-    beside: list[float] = []
-    for _ in range(NODES - 1):
-        before, now = now, at * now - (beside[-1] if beside else 0.0) * before
-        beside.append(float(weight @ now**2) / norm)
-        norm *= beside[-1]
-    root = np.sqrt(beside)
-    nodes, vectors = np.linalg.eigh(np.diag(root, 1) + np.diag(root, -1))
-    return nodes, vectors[0] ** 2
-
-
-def gaussians(
-    x_px: FloatArray, y_px: FloatArray, covariance: FloatArray, side_px: FloatArray
-) -> FloatArray:
-    """Shares (n, h, w) of pixels at offsets (n, w), (n, h): Gaussians of covariance xx, xy, yy
-    (n, 3), over squares (n,).
-    """
-    xx, xy, yy = covariance.T
-    xx, yy = np.maximum(xx, MIN_VARIANCE_PX2), np.maximum(yy, MIN_VARIANCE_PX2)
-    most = 0.95 * np.sqrt(xx * yy)
-    xy = np.clip(xy, -most, most)
-    determinant = xx * yy - xy**2
-    nodes, weights = (
-        np.stack(part)
-        for part in zip(*(_quadrature(float(side)) for side in np.round(side_px, 3)), strict=True)
-    )
-    x, y = ((off[:, :, None] + nodes[:, None]).reshape(len(nodes), -1) for off in (x_px, y_px))
-    scale = -0.5 / determinant
-    light = (2 * scale * -xy)[:, None, None] * y[:, :, None] * x[:, None]
-    light += (scale * xx)[:, None, None] * (y * y)[:, :, None]
-    light += (scale * yy)[:, None, None] * (x * x)[:, None]
-    np.exp(light, out=light)
-    across = light.reshape(*y.shape, -1, NODES) @ weights[:, None, :, None]
-    down = weights[:, None, None] @ across.reshape(len(y), -1, NODES, x_px.shape[1])
-    return np.asarray(down[:, :, 0] / (2 * np.pi * np.sqrt(determinant))[:, None, None])
+    """The first terms (n, count) of scaled places (n, 2): 1, 3 or 6 of them."""
+    return place_terms(*place.T)[:, :count]
 
 
 def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray) -> FloatArray:
@@ -382,7 +346,7 @@ def fit_effective(dots: Dots, per_px: int) -> Found:
     half = dots.images.shape[1] // 2
     found, variance = (
         _glass(final, place, half, per_px),
-        final.covariance[0, [0, 2]].clip(min=MIN_VARIANCE_PX2),
+        final.covariance[0, :XY].clip(min=MIN_VARIANCE_PX2),
     )
     return Found(
         found,
@@ -402,25 +366,11 @@ def _knots(dots: Dots) -> FloatArray:
 
 
 def _each_gaussian(dots: Dots) -> tuple[Dots, FloatArray]:
-    """Dots with their places, and covariances (n, 3), each by a Gaussian of its own
-    (Gauss-Newton).
-    """
-    covariance = np.tile([0.5, 0.0, 0.5], (len(dots.x_px), 1))
-    for _ in range(FIT_ROUNDS):
-        own = gaussians(*dots.offsets, covariance, dots.side_px)
-        slopes = [
-            (gaussians(*moved, covariance, dots.side_px) - own) / STEP_PX for moved in _moved(dots)
-        ]
-        for k in range(3):
-            more = covariance.copy()
-            more[:, k] += STEP_PX2
-            slopes.append((gaussians(*dots.offsets, more, dots.side_px) - own) / STEP_PX2)
-        _, steps = _amplitudes(dots, own, slopes)
-        steps = np.clip(steps, -0.3, 0.3)
-        dots = replace(dots, x_px=dots.x_px + steps[:, 0], y_px=dots.y_px + steps[:, 1])
-        covariance = np.asarray(covariance + steps[:, 2:])
-        covariance[:, [0, 2]] = covariance[:, [0, 2]].clip(min=MIN_VARIANCE_PX2)
-    return dots, covariance
+    """Dots with their places, and covariances (n, 3), each by a Gaussian of its own."""
+    points = PointImages(dots.images, 1 / dots.variance, dots.column, dots.row, dots.side_px)
+    covariance = np.tile(FIRST_COVARIANCE_PX2, (len(dots.x_px), 1))
+    fitted = fit_each(points, PointGaussians(dots.x_px, dots.y_px, covariance))
+    return replace(dots, x_px=fitted.x_px, y_px=fitted.y_px), fitted.covariance
 
 
 def _moved(dots: Dots) -> tuple[tuple[FloatArray, FloatArray], ...]:
@@ -429,39 +379,22 @@ def _moved(dots: Dots) -> tuple[tuple[FloatArray, FloatArray], ...]:
     return (x - STEP_PX, y), (x, y - STEP_PX)
 
 
-def _amplitudes(
-    dots: Dots, own: FloatArray, slopes: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Light and background (n, 2) of dots by weighted least squares, and steps (n, k) along
-    `slopes` of the model.
-    """
-    columns = np.stack([own, np.ones_like(own), *slopes], axis=1).reshape(
-        len(own), 2 + len(slopes), -1
-    )
-    weight = 1 / dots.variance.reshape(len(own), 1, -1)
-    normal = (columns * weight) @ columns.transpose(0, 2, 1)
-    size = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), 1e-300))
-    normal = normal / size[:, :, None] / size[:, None, :] + 1e-9 * np.eye(normal.shape[1])
-    right = np.einsum("nkp,np->nk", columns * weight, dots.images.reshape(len(own), -1)) / size
-    found = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0] / size, np.float64)
-    return found[:, :2], np.asarray(found[:, 2:] / np.maximum(np.abs(found[:, :1]), 1e-300))
-
-
 def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]:
     """Dots with their places by a model, its shares (n, s, s), and their light and background
     (n, 2).
     """
-    x_px, y_px = dots.x_px, dots.y_px
+    x_px, y_px, weight = dots.x_px, dots.y_px, 1 / dots.variance
     for _ in range(PLACE_ROUNDS):
-        own = model.of(x_px, y_px, dots.offsets, dots.side_px)
-        slopes = [
-            (model.of(x_px, y_px, moved, dots.side_px) - own) / STEP_PX for moved in _moved(dots)
-        ]
-        _, steps = _amplitudes(dots, own, slopes)
-        steps = np.clip(steps, -0.3, 0.3)
+        shares = model.of(x_px, y_px, dots.offsets, dots.side_px)
+        columns = [shares, np.ones_like(shares)]
+        for moved in _moved(dots):
+            columns.append((model.of(x_px, y_px, moved, dots.side_px) - shares) / STEP_PX)
+        solved = amplitudes(columns, weight, dots.images)
+        steps = solved[:, 2:] / np.maximum(np.abs(solved[:, :1]), SMALLEST)
+        steps = np.clip(steps, -MAX_STEP_PX, MAX_STEP_PX)
         dots = replace(dots, x_px=dots.x_px + steps[:, 0], y_px=dots.y_px + steps[:, 1])
-    own = model.of(x_px, y_px, dots.offsets, dots.side_px)
-    return dots, own, _amplitudes(dots, own, ())[0]
+    shares = model.of(x_px, y_px, dots.offsets, dots.side_px)
+    return dots, shares, amplitudes((shares, np.ones_like(shares)), weight, dots.images)
 
 
 def _fitted(
@@ -472,16 +405,7 @@ def _fitted(
     """
     place = (np.stack([dots.x_px, dots.y_px], axis=1) - start.middle_px) / start.scale_px
     terms = terms_of(place, len(start.covariance))
-    # Robust: a dot with a neighbour or a hot pixel has another covariance.
-    weight = np.ones(len(terms))
-    coefficients = start.covariance
-    for _ in range(5):
-        coefficients = np.asarray(
-            np.linalg.lstsq(terms * weight[:, None], covariance * weight[:, None], rcond=None)[0],
-            np.float64,
-        )
-        off = np.abs(covariance - terms @ coefficients).max(axis=1)
-        weight = 1 / np.maximum(1.0, off / max(2 * float(np.median(off)), 1e-9))
+    coefficients = over_field(terms, covariance)
     model = replace(start, covariance=coefficients)
     if not count:
         return model, dots

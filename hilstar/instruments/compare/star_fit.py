@@ -24,14 +24,13 @@ from scipy.special import ndtr
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.optics.psf import GaussianPsf, Psf
+from hilstar.optics.psf_fit import XY, PointGaussians, PointImages, fit_each
 
 # Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see
 # tests/gpu), which are no stars.
 RIPPLE_SHARE = 1e-5
 SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
-SIGMA_STEPS = 12
-# largest relative step of sigma: Newton's step from a poor start stays positive
-MAX_SIGMA_STEP = 0.3
+SIGMA_ROUNDS = 12
 MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
 # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
 MAX_OFFSET_PX = 1.0
@@ -191,7 +190,7 @@ def around(image: FloatArray, psf: Psf) -> FloatArray:
 
 
 def star_psf(image: FloatArray) -> GaussianPsf:
-    """The Gaussian of an image's stars: Newton's steps on the brightest, from the image's
+    """The Gaussian of an image's stars: that which the brightest have in common, from the image's
     correlation of neighbours.
     """
     # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own
@@ -205,21 +204,28 @@ def star_psf(image: FloatArray) -> GaussianPsf:
         math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04))
         for part in correlations
     )
-    sigma, first = np.array([x, y]), GaussianPsf((x, y))
+    first = GaussianPsf((x, y))
     found = bright_pixels(image, RIPPLE_SHARE * around(image, first))
     places = _apart(found, first.footprint_px, (image.shape[1], image.shape[0]))
-    reach = first.footprint_px // 2 + 1
-    padded = np.pad(image, 2 * reach)
-    for _ in range(SIGMA_STEPS):
-        steps = _sigma_steps(padded, places, sigma, reach)
-        good = np.isfinite(steps).all(axis=1)
-        if not good.any():
-            break
-        places[good] += np.clip(steps[good, :2], -0.5, 0.5)
-        sigma = sigma + np.clip(
-            np.median(steps[good, 2:], axis=0), -MAX_SIGMA_STEP * sigma, MAX_SIGMA_STEP * sigma
-        )
-    return GaussianPsf((float(sigma[0]), float(sigma[1])))
+    points = star_points(image, places, first.footprint_px // 2 + 1)
+    covariance = np.tile([x * x, y * y, 0.0], (len(places), 1))
+    start = PointGaussians(places[:, 0], places[:, 1], covariance)
+    fitted = fit_each(points, start, SIGMA_ROUNDS, alike=True)
+    sigma_x, sigma_y = np.sqrt(fitted.covariance[0, :XY])
+    return GaussianPsf((float(sigma_x), float(sigma_y)))
+
+
+def star_points(image: FloatArray, places_px: FloatArray, reach_px: int) -> PointImages:
+    """The images of stars at places (n, 2), px, to `reach_px` about them; 0 off the image."""
+    middle = np.rint(places_px).astype(np.intp)
+    steps = np.arange(2 * reach_px + 1)
+    padded = np.pad(image, reach_px)
+    rows, columns = middle[:, 1, None] + steps, middle[:, 0, None] + steps
+    images = padded[rows[:, :, None], columns[:, None, :]]
+    none_px = np.zeros(len(middle))
+    return PointImages(
+        images, np.ones_like(images), middle[:, 0], middle[:, 1], none_px, has_level=False
+    )
 
 
 def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
@@ -231,34 +237,6 @@ def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) 
     edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
     alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
     return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
-
-
-def _sigma_steps(
-    padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray, reach_px: int
-) -> FloatArray:
-    """Newton's steps (n, 4) of each star by itself: x, y, sigma x, sigma y."""
-    parts, pixels = [], []
-    for axis in (0, 1):
-        pixel = np.rint(places_px[:, axis]).astype(np.intp)[:, None] + np.arange(
-            -reach_px, reach_px + 1
-        )
-        near, far = (
-            (pixel - places_px[:, axis, None] + side) / sigma_px[axis] for side in (-0.5, 0.5)
-        )
-        widen = (near * _bell(near) - far * _bell(far)) / sigma_px[axis]
-        parts.append((ndtr(far) - ndtr(near), (_bell(near) - _bell(far)) / sigma_px[axis], widen))
-        pixels.append(np.clip(pixel + 2 * reach_px, 0, padded.shape[1 - axis] - 1))
-    (x, slope_x, widen_x), (y, slope_y, widen_y) = parts
-    pairs = ((y, x), (y, slope_x), (slope_y, x), (y, widen_x), (widen_y, x))
-    columns = np.stack([v[:, :, None] * u[:, None, :] for v, u in pairs], axis=1).reshape(
-        len(places_px), 5, -1
-    )
-    light = padded[pixels[1][:, :, None], pixels[0][:, None, :]].reshape(len(places_px), -1, 1)
-    fitted = np.linalg.pinv(columns @ columns.transpose(0, 2, 1), hermitian=True) @ (
-        columns @ light
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(fitted[:, 1:, 0] / fitted[:, :1, 0])
 
 
 def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:

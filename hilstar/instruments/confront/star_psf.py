@@ -15,14 +15,19 @@ from scipy.special import expit
 
 from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.instruments.confront.camera_fit import minimised
+from hilstar.optics.psf_fit import (
+    PixelGaussians,
+    PointGaussians,
+    PointImages,
+    fit_each,
+    normal_equations,
+    place_terms,
+)
 
 STAMP_PX = 11
 HALF = STAMP_PX // 2
-# nodes within a pixel
-GAUSS3 = (
-    np.array([-math.sqrt(0.6) / 2, 0.0, math.sqrt(0.6) / 2]),
-    np.array([5 / 18, 8 / 18, 5 / 18]),
-)
+NODES = 3  # within a pixel: right to 1e-3 of its light from 0.35 px of sigma
+START_ROUNDS = 4  # of each star's own Gaussian, from whose median the PSF's starts
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 5.0
 MEAN_BV_MAG = 0.65
 PLACE_STEPS, SHAPE_ROUNDS = 8, 2
@@ -86,11 +91,13 @@ class StarPsf:
 
         With them their derivatives by the star's x and y.
         """
-        share = self.wing_share
-        both = (1 - share) * _gaussian(dx, dy, core) + share * _gaussian(
-            dx, dy, self._wing(len(core))
+        narrow = _gaussians(dx, dy, core).slopes()
+        wide = _gaussians(dx, dy, self._wing(len(core))).slopes()
+        share, by_x, by_y = (
+            (1 - self.wing_share) * of_core + self.wing_share * of_wing
+            for of_core, of_wing in zip(narrow, wide, strict=True)
         )
-        return both[0], both[1], both[2]
+        return share, by_x, by_y
 
     def by_shape(
         self, dx: FloatArray, dy: FloatArray, core: FloatArray
@@ -98,10 +105,12 @@ class StarPsf:
         """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the
         wings' share and sigma.
         """
-        share, narrow = self.wing_share, _gaussian(dx, dy, core, shape=True)
-        wide = _gaussian(dx, dy, self._wing(len(core)), shape=True)
+        share = self.wing_share
+        narrow = _gaussians(dx, dy, core).slopes(shape=True)
+        wide = _gaussians(dx, dy, self._wing(len(core))).slopes(shape=True)
         by_wing = share * 2 * self.wing_sigma_px * (wide[3] + wide[4])
-        slopes = np.stack([*((1 - share) * narrow[3:]), wide[0] - narrow[0], by_wing])
+        by_core = [(1 - share) * slope for slope in narrow[3:]]
+        slopes = np.stack([*by_core, wide[0] - narrow[0], by_wing])
         return (1 - share) * narrow[0] + share * wide[0], slopes
 
     def _wing(self, count: int) -> FloatArray:
@@ -125,39 +134,13 @@ def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) ->
     """Terms (n, 6) of the field."""
     half = math.hypot(*size_px) / 2
     u, v = (x_px - (size_px[0] - 1) / 2) / half, (y_px - (size_px[1] - 1) / 2) / half
-    return np.column_stack([np.ones_like(u), u * u + v * v, u, v, u * u - v * v, u * v])
+    one, u, v, uu, uv, vv = place_terms(u, v).T
+    return np.column_stack([one, uu + vv, u, v, uu - vv, uv])
 
 
-def _gaussian(
-    dx: FloatArray, dy: FloatArray, covariance: FloatArray, shape: bool = False
-) -> FloatArray:
-    """Integrals (3, n, rows, columns) of Gaussians over pixels and their derivatives by the
-    centre's x and y.
-
-    By nine points in each pixel: good to 1e-3 from 0.35 px of sigma. With `shape` there are six,
-    also by xx, yy and xy.
-    """
-    xx, yy, xy = (covariance[:, k, None, None] for k in range(3))
-    det = xx * yy - xy * xy
-    nodes, weights = GAUSS3
-    total = np.zeros((6 if shape else 3, len(dx), dy.shape[1], dx.shape[1]))
-    for a, wa in zip(nodes, weights, strict=True):
-        x = (dx + a)[:, None, :]
-        for b, wb in zip(nodes, weights, strict=True):
-            y = (dy + b)[:, :, None]
-            by_x, by_y = (yy * x - xy * y) / det, (xx * y - xy * x) / det
-            light = wa * wb * np.exp(-0.5 * (x * by_x + y * by_y))
-            total[0] += light
-            total[1] += light * by_x
-            total[2] += light * by_y
-            if shape:
-                total[3] += light * by_x**2
-                total[4] += light * by_y**2
-                total[5] += light * by_x * by_y
-    if shape:
-        total[3:5] = (total[3:5] - total[0] * np.stack([yy, xx]) / det) / 2
-        total[5] += total[0] * xy / det
-    return np.asarray(total / (2 * math.pi * np.sqrt(det)))
+def _gaussians(dx: FloatArray, dy: FloatArray, covariance: FloatArray) -> PixelGaussians:
+    """Gaussians of points in pixels at offsets from them."""
+    return PixelGaussians(dx, dy, covariance, np.zeros(len(dx)), NODES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +256,9 @@ def measure(
             len(x), -1
         )
         w = weight.reshape(len(x), -1)
-        normal = np.einsum("nik,nk,njk->nij", flat, w, flat) + 1e-12 * np.eye(4)
-        move = np.linalg.solve(normal, np.einsum("nik,nk,nk->ni", flat, w, off)[..., None])[..., 0]
+        normal, right = normal_equations(flat, w, off)
+        normal += 1e-12 * np.eye(4)
+        move = np.linalg.solve(normal, right[..., None])[..., 0]
         x += np.clip(move[:, 0], -0.5, 0.5)
         y += np.clip(move[:, 1], -0.5, 0.5)
         flux, level = flux + move[:, 2], level + move[:, 3]
@@ -308,14 +292,8 @@ def fit_psf(
     """The PSF of stars that stand alone and are not saturated, from starting places."""
     terms = next(count for least, count in STARS_FOR if len(stamps) >= least)
     start = np.zeros((3, terms))
-    start[:2, 0] = 0.8
+    start[:, 0] = _first_covariance(stamps, x_px, y_px)
     psf = StarPsf(start, 0.0, 0.05, 2.0, size_px)
-    psf = replace(
-        psf,
-        covariance=np.array(
-            [[s, *np.zeros(terms - 1)] for s in (_first_width(stamps), _first_width(stamps), 0.0)]
-        ),
-    )
     x, y = x_px, y_px
     found = measure(stamps, psf, x, y, gain_e_per_dn)
     for number in range(SHAPE_ROUNDS):
@@ -329,6 +307,17 @@ def fit_psf(
             gain_e_per_dn,
         )
     return psf
+
+
+def _first_covariance(stamps: Stamps, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """The median covariance, xx, yy and xy, px^2, of the stars, each by a Gaussian of its own."""
+    weight = 1 / stamps.variance
+    none_px = np.zeros(len(stamps))
+    points = PointImages(stamps.values, weight, stamps.column, stamps.row, none_px)
+    width = _first_width(stamps)
+    covariance = np.tile([width, width, 0.0], (len(stamps), 1))
+    fitted = fit_each(points, PointGaussians(x_px, y_px, covariance), START_ROUNDS)
+    return np.asarray(np.median(fitted.covariance, axis=0))
 
 
 def _first_width(stamps: Stamps) -> float:

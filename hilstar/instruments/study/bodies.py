@@ -18,13 +18,9 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import (
     BLUE,
-    INK,
     MUTED,
-    SERIES,
     capital,
     chart,
-    label_ends,
-    plain_ticks,
     value_bars,
     write_records,
 )
@@ -32,6 +28,17 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_S
 from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.instruments.study.row_charts import (
+    HIDDEN,
+    ChartSpec,
+    LevelLine,
+    LineSpec,
+    PanelSpec,
+    at_least,
+    draw_rows,
+    looks_of,
+    row_panels,
+)
 from hilstar.instruments.study.settings import FULL_HD, Table, study_bench
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, Spent, in_turn
 from hilstar.optics.camera import Camera
@@ -85,6 +92,71 @@ ROUNDS, QUICK_ROUNDS = 40, 3
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
 FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
 FLOOR = 1e-6  # lower end of the chart's axis
+SMALL = {"ms": 4}
+SIZE_NOTE = (
+    f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it is"
+    " drawn as a point."
+)
+SIZE_PANELS = (
+    PanelSpec(
+        (LineSpec("radius_px", at_least("flux_off", FLOOR), marker="o", look=SMALL),),
+        "error [share]",
+        title="Light of the whole disc",
+        levels=(LevelLine(FLUX_LIMIT, "limit"),),
+        scales=("log", "log"),
+    ),
+    PanelSpec(
+        (
+            LineSpec(
+                "radius_px", at_least("limb_off_px", FLOOR), marker="s", named=False, look=SMALL
+            ),
+            LineSpec("radius_px", at_least("middle_off_px", FLOOR), ":", marker="o", look=SMALL),
+        ),
+        "error [px]",
+        title="Place of its limb (squares, solid) and of its middle (dotted)",
+        levels=(LevelLine(LIMB_LIMIT_PX, "limit"),),
+        scales=("log", "log"),
+    ),
+    PanelSpec(
+        (
+            LineSpec("radius_px", at_least("pixel_off", FLOOR), marker="o", look=SMALL),
+            LineSpec(
+                "radius_px",
+                at_least("point_pixel_off", FLOOR),
+                ":",
+                marker="x",
+                named=False,
+                look=SMALL,
+            ),
+        ),
+        "error [of the brightest]",
+        "radius of the Moon's disc [px]",
+        title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)",
+        scales=("log", "log"),
+    ),
+)
+LIMIT_NOTE = (
+    "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080, drawn in"
+    " software."
+)
+LIMIT_TICKS_DEG = (-70, -20, -8, -3, -1, 0, 1, 3, 8, 20, 40)
+# The panels share an x axis, which is the lower one's.
+LIMIT_PANELS = (
+    PanelSpec(
+        (LineSpec("off_deg", "cpu_ms", marker="o", look=SMALL),),
+        "processor time of a frame [ms]",
+        levels=(LevelLine(1e3 / REFRESH_HZ, f"{REFRESH_HZ:g} Hz"),),
+        from_zero=True,
+    ),
+    PanelSpec(
+        (LineSpec("off_deg", "over_white_mag", marker="o", look=SMALL),),
+        "brightest pixel over white [mag]",
+        "angle from the boresight [deg]",
+        levels=(LevelLine(0, "white"),),
+        scales=("symlog", "linear"),
+        xticks=LIMIT_TICKS_DEG,
+    ),
+)
 
 
 @contextmanager
@@ -485,71 +557,25 @@ def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
 
 def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
     """The errors of discs against their radius."""
-    note = (
-        f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it"
-        " is drawn as a point."
+    looks = looks_of({phase_deg: f"{phase_deg:g} deg" for phase_deg in PHASES_DEG})
+    layout = {"height_inch": 8.4}
+    light, place, pixel = SIZE_PANELS
+    with_ticks = replace(pixel, xticks=sorted({size.radius_px for size in sizes}))
+    spec = ChartSpec(
+        (light, place, with_ticks),
+        lambda size: size.phase_deg,
+        looks,
+        SIZE_NOTE,
+        layout=layout,
     )
-    with chart(path, _size_line(sizes), panels=3, note=note, height_inch=8.4) as panels:
-        light, place, pixel = panels
-        for phase_deg, colour in zip(PHASES_DEG, SERIES, strict=False):
-            rows = [size for size in sizes if size.phase_deg == phase_deg]
-            radius, label = [size.radius_px for size in rows], f"{phase_deg:g} deg"
-            for axes, name, style, shown in (
-                (light, "flux_off", "o-", label),
-                (place, "limb_off_px", "s-", "_"),
-                (place, "middle_off_px", "o:", label),
-                (pixel, "pixel_off", "o-", label),
-                (pixel, "point_pixel_off", "x:", "_"),
-            ):
-                values = [max(abs(getattr(size, name)), FLOOR) for size in rows]
-                axes.loglog(radius, values, style, color=colour, ms=4, label=shown)
-        light.set(title="Light of the whole disc", ylabel="error [share]")
-        place.set(
-            title="Place of its limb (squares, solid) and of its middle (dotted)",
-            ylabel="error [px]",
-        )
-        pixel.set(
-            title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)",
-            ylabel="error [of the brightest]",
-        )
-        pixel.axvline(DISC_PX / 2, color=MUTED, linestyle="--", lw=1.2, label="_")
-        for axes, limit in ((light, FLUX_LIMIT), (place, LIMB_LIMIT_PX)):
-            axes.axhline(limit, color=INK, linestyle="--", lw=1.2, label="limit")
-        plain_ticks(pixel.xaxis, sorted({size.radius_px for size in sizes}))
-        pixel.set_xlabel("radius of the Moon's disc [px]")
-        label_ends(*panels)
+    with row_panels(path, _size_line(sizes), spec, sizes) as panels:
+        panels[2].axvline(DISC_PX / 2, color=MUTED, linestyle="--", lw=1.2, label=HIDDEN)
 
 
 def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
     """Processor time and light as bodies come near."""
-    note = (
-        "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080,"
-        " drawn in software."
-    )
     title = load.title(_limits_line(nears), f"Every pixel's light is {light_words(nears)}")
-    with chart(path, title, panels=2, note=load.note(note)) as (times, light):
-        for body, colour in zip(dict.fromkeys(near.body for near in nears), SERIES, strict=False):
-            rows = [near for near in nears if near.body == body]
-            off_deg = [near.off_deg for near in rows]
-            times.plot(
-                off_deg, [near.cpu_ms for near in rows], "o-", ms=4, color=colour, label=body
-            )
-            light.plot(
-                off_deg,
-                [near.over_white_mag for near in rows],
-                "o-",
-                ms=4,
-                color=colour,
-                label=body,
-            )
-        times.axhline(
-            1e3 / REFRESH_HZ, color=INK, linestyle="--", lw=1.2, label=f"{REFRESH_HZ:g} Hz"
-        )
-        light.axhline(0, color=INK, linestyle="--", lw=1.2, label="white")
-        times.set_ylim(bottom=0)
-        times.set_ylabel("processor time of a frame [ms]")
-        light.set_ylabel("brightest pixel over white [mag]")
-        light.set_xlabel("angle from the boresight [deg]")
-        light.set_xscale("symlog", linthresh=1.0)
-        plain_ticks(light.xaxis, (-70, -20, -8, -3, -1, 0, 1, 3, 8, 20, 40))
-        label_ends(times, light)
+    bodies = dict.fromkeys(near.body for near in nears)
+    looks = looks_of({body: body for body in bodies})
+    spec = ChartSpec(LIMIT_PANELS, lambda near: near.body, looks, LIMIT_NOTE)
+    draw_rows(path, title, spec, nears, load)

@@ -3,23 +3,13 @@ over an exposure.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    TEAL,
-    chart,
-    label_ends,
-    plain_ticks,
-    write_records,
-)
+from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, write_records
 from hilstar.basics.units import flux_ratio
 from hilstar.display.balance import AS_USUAL, Balance
 from hilstar.display.phases import (
@@ -42,6 +32,14 @@ from hilstar.display.response import (
     table_response,
 )
 from hilstar.display.temporal import TemporalQuantiser
+from hilstar.instruments.study.row_charts import (
+    ChartSpec,
+    LineSpec,
+    PanelSpec,
+    draw_rows,
+    finite,
+    looks_of,
+)
 from hilstar.optics.sprites import FrameLight, pack_sprites
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
@@ -69,6 +67,11 @@ ERROR_COLUMNS = (
 FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)
 BEGINS = (2.0, 3.4, 5.7, 7.1)  # refreshes: exposures begin within frames too
 AIM_FRAMES = 6
+MANY_STEPS = 100  # from which on they are told without a decimal
+FRAMES_NOTE = (
+    "Solid: temporal. Dotted: dither with a mask that turns. Steps: a star's light in steps of the"
+    " panel from black."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,31 +246,45 @@ def draw(path: Path, left: list[OverFrames]) -> None:
         f"Over any {AIM_FRAMES} frames temporal places stars within {at[names[0]]:.2g} px rms on"
         f" {names[0]}, and within {at[names[-1]]:.2g} px on {names[-1]}"
     )
-    note = (
-        "Solid: temporal. Dotted: dither with a mask that turns. Steps: a star's light in steps of"
-        " the panel from black."
+    panels = (
+        frames_panel("flux_rms_mag", "flux error, rms [mag]"),
+        replace(
+            frames_panel("axis_rms_px_fit", "place by a PSF fit, rms [px]"),
+            xlabel="frames of an exposure",
+            xticks=sorted({row.frames for row in left}),
+        ),
     )
-    with chart(path, finding, panels=2, note=note) as (flux, place):
-        for name, colour in zip(names, (BLUE, ORANGE, GREEN, PURPLE, TEAL), strict=True):
-            for method, style in (("temporal", "-o"), ("dither", ":")):
-                rows = [row for row in left if (row.panel, row.method) == (name, method)]
-                frames = [row.frames for row in rows]
-                steps = f"{rows[0].steps:.{1 if rows[0].steps < 100 else 0}f}"
-                for axes, error, label in (
-                    (flux, "flux_rms_mag", f"{name}: {steps} steps"),
-                    (place, "axis_rms_px_fit", name),
-                ):
-                    errors = np.array([getattr(row, error) for row in rows])
-                    values = np.where(np.isfinite(errors), errors, np.nan)
-                    axes.loglog(
-                        frames,
-                        values,
-                        style,
-                        color=colour,
-                        ms=4,
-                        label=label if method == "temporal" else "_",
-                    )
-        flux.set_ylabel("flux error, rms [mag]")
-        place.set(ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
-        plain_ticks(place.xaxis, sorted({row.frames for row in left}))
-        label_ends(flux, place)
+    looks = looks_of({name: name for name in names})
+    draw_rows(path, finding, ChartSpec(panels, lambda row: row.panel, looks, FRAMES_NOTE), left)
+
+
+def frames_panel(error: str, ylabel: str) -> PanelSpec:
+    """An error over the frames of an exposure, by `temporal` and by `dither`; the flux's has the
+    steps.
+    """
+    label = steps_words if error == "flux_rms_mag" else None
+    temporal = LineSpec(
+        "frames",
+        finite(error),
+        marker="o",
+        label=label,
+        where=lambda row: row.method == "temporal",
+        look={"ms": 4},
+    )
+    dither = LineSpec(
+        "frames",
+        finite(error),
+        ":",
+        named=False,
+        where=lambda row: row.method == "dither",
+        look={"ms": 4},
+    )
+    return PanelSpec((temporal, dither), ylabel, scales=("log", "log"))
+
+
+def steps_words(row: OverFrames) -> str:
+    """A panel, and how many of its steps a star's light is."""
+    decimals = 0
+    if row.steps < MANY_STEPS:
+        decimals = 1
+    return f"{row.panel}: {row.steps:.{decimals}f} steps"

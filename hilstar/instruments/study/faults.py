@@ -9,10 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.charts import BLUE, GREEN, INK, MUTED, chart, label_ends, write_records
+from hilstar.basics.charts import BLUE, GREEN, MUTED, chart, write_records
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from hilstar.basics.units import NS_PER_S, magnitude
 from hilstar.display.quantise import shown_light
+from hilstar.instruments.study.row_charts import (
+    ChartSpec,
+    LevelLine,
+    LineSpec,
+    PanelSpec,
+    SeriesLook,
+    draw_rows,
+    finite,
+)
 from hilstar.instruments.study.settings import FULL_HD, Isolation, Table, lone_windows, study_bench
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.extended import GlowLight
@@ -34,6 +43,29 @@ ISOLATION = Isolation(margin_px=7, max_share=1e-3)
 SHARES = (0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 QUICK_SHARES = (0.0, 0.01, 1.0)
 SPOILT_MAG, DARK_MAG = 0.1, 90.0
+STRAY_NOTE = (
+    "Solid: 95 % of the stars are within it. Dotted: half of them. A line ends where such a star"
+    " shows nothing."
+)
+STRAY_PANEL = PanelSpec(
+    (
+        LineSpec(
+            "share_of_white",
+            finite("p95_mag", DARK_MAG),
+            label=lambda row: f"{row.quantisation}, 95 %",
+        ),
+        LineSpec(
+            "share_of_white",
+            finite("median_mag", DARK_MAG),
+            ":",
+            label=lambda row: f"{row.quantisation}, half",
+        ),
+    ),
+    "error of stars' light [mag]",
+    "even stray light [share of white in a monitor pixel]",
+    levels=(LevelLine(SPOILT_MAG, f"{SPOILT_MAG:g} mag"),),
+    scales=("log", "log"),
+)
 LOST_MAG = 1.0  # a star this much too faint is not the star that was asked for
 
 NOWHERE = "a scenario, nothing on"
@@ -243,30 +275,9 @@ def draw_stray(path: Path, strays: list[Stray]) -> None:
         if said
         else "No stray light spoils stars"
     )
-    note = (
-        "Solid: 95 % of the stars are within it. Dotted: half of them. A line ends where such a"
-        " star shows nothing."
-    )
-    with chart(path, finding, note=note) as (axes,):
-        for name, colour in COLOURS.items():
-            light = [one for one in strays if one.quantisation == name and one.share_of_white]
-            for error, style, label in (
-                ("p95_mag", "o-", f"{name}, 95 %"),
-                ("median_mag", "o:", f"{name}, half"),
-            ):
-                values = [
-                    getattr(one, error) if getattr(one, error) < DARK_MAG else np.nan
-                    for one in light
-                ]
-                axes.loglog(
-                    [one.share_of_white for one in light], values, style, color=colour, label=label
-                )
-        axes.axhline(SPOILT_MAG, color=INK, ls="--", lw=1.2, label=f"{SPOILT_MAG:g} mag")
-        axes.set(
-            xlabel="even stray light [share of white in a monitor pixel]",
-            ylabel="error of stars' light [mag]",
-        )
-        label_ends(axes)
+    looks = {name: SeriesLook(name, colour, "o") for name, colour in COLOURS.items()}
+    spec = ChartSpec((STRAY_PANEL,), lambda row: row.quantisation, looks, STRAY_NOTE)
+    draw_rows(path, finding, spec, [row for row in strays if row.share_of_white])
 
 
 def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import INK, SERIES, chart, label_ends, plain_ticks, write_records
+from hilstar.basics.charts import write_records
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.geometric.calibration import matched
@@ -32,6 +32,15 @@ from hilstar.instruments.calibrate.geometric.fit import (
 )
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import Observed
+from hilstar.instruments.study.row_charts import (
+    ChartSpec,
+    LevelLine,
+    LineSpec,
+    PanelSpec,
+    Where,
+    draw_rows,
+    looks_of,
+)
 from hilstar.optics.camera import Camera
 
 RADII_MM = (62.8, -45.7, -128.2)
@@ -39,6 +48,23 @@ THICKNESS_MM = (4.0, 2.5)
 INDEX = (1.0, 1.5168, 1.6727, 1.0)
 BACK_FOCUS_MM = 97.1
 DESIGN_FOCAL_MM = 100.0
+SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
+NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+USUAL_SIZE, USUAL_NOISE_PX = (20, 60), 0.02
+STARS = 4000
+FAIL_ARCSEC = 1.0
+SEED = 7
+MARKERS = "osd^"
+SHORT = {
+    "the same with a field of degree 4": "with a field, degree 4",
+    "Brown-Conrady with tilt": "Brown-Conrady, tilt",
+}
+HELD_OUT_WIDTH = 1.2
+NOTE = (
+    f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames"
+    f" of {USUAL_SIZE[1]} dots with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
+)
+TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +192,6 @@ def _refracted(
 
 
 BENCH = TracedBench(lens_shift_mm=(8.0, -5.0), lens_tilt_deg=(4.0, 2.5))
-TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,17 +220,6 @@ MODELS = (
     LensModel("Brown-Conrady with tilt", BROWN_CONRADY),
     LensModel("the same with a field of degree 4", BROWN_CONRADY, 4),
 )
-SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
-NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
-USUAL_SIZE, USUAL_NOISE_PX = (20, 60), 0.02
-STARS = 4000
-FAIL_ARCSEC = 1.0
-SEED = 7
-MARKERS = "osd^"
-SHORT = {
-    "the same with a field of degree 4": "with a field, degree 4",
-    "Brown-Conrady with tilt": "Brown-Conrady, tilt",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,47 +240,50 @@ class CalibrationOutcome:
 
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `geometry.csv` and its chart; a line for each model. Raises InputError."""
-    sizes = SIZES[1:4:2] if quick else SIZES
-    noises = (USUAL_NOISE_PX, NOISES_PX[-1]) if quick else NOISES_PX
-    shown = {Frames(*size, USUAL_NOISE_PX) for size in sizes} | {
-        Frames(*USUAL_SIZE, noise) for noise in noises
-    }
-    outcomes = [outcome for frames in sorted(shown) for outcome in _outcomes(frames)]
+    outcomes: list[CalibrationOutcome] = []
+    for frames in frames_of(quick):
+        outcomes += _outcomes(frames)
     write_records(directory / "geometry.csv", outcomes)
     usual = [
-        o
-        for o in outcomes
-        if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX
+        outcome for outcome in outcomes if has_usual_noise(outcome) and has_usual_size(outcome)
     ]
-    best = min(usual, key=lambda o: o.held_out_arcsec)
+    best = min(usual, key=lambda outcome: outcome.held_out_arcsec)
     uncalibrated = ideal_arcsec()
     finding = (
         f"Uncalibrated stars are off by {uncalibrated:.0f} arcsec rms, by {usual[0].model}"
         f" {usual[0].stars_rms_arcsec:.0f}, by the model that held-out dots choose ({best.model})"
         f" {best.stars_rms_arcsec:.2g}"
     )
-    _draw(directory / "geometry", finding, outcomes, uncalibrated)
-    lines = []
-    for o in usual:
-        fails = "" if o.stars_max_arcsec < FAIL_ARCSEC else f"; FAILS: over {FAIL_ARCSEC:g} arcsec"
-        stars = f"stars {o.stars_rms_arcsec:.3g} arcsec rms, {o.stars_max_arcsec:.3g} maximum"
-        lines.append(f"{o.model}: {stars}; held-out dots {o.held_out_arcsec:.3g} rms{fails}")
-    return [finding, *lines]
+    draw(directory / "geometry", finding, outcomes, uncalibrated)
+    return [finding, *(line_of(outcome) for outcome in usual)]
+
+
+def frames_of(quick: bool) -> list[Frames]:
+    """The sets of frames that are measured: usual noise by size, and the usual size by noise."""
+    sizes: tuple[tuple[int, int], ...] = SIZES
+    noises: tuple[float, ...] = NOISES_PX
+    if quick:
+        sizes, noises = SIZES[1:4:2], (USUAL_NOISE_PX, NOISES_PX[-1])
+    by_size = {Frames(*size, USUAL_NOISE_PX) for size in sizes}
+    by_noise = {Frames(*USUAL_SIZE, noise) for noise in noises}
+    return sorted(by_size | by_noise)
+
+
+def line_of(outcome: CalibrationOutcome) -> str:
+    """A model's errors in words."""
+    stars_rms, held_out_rms = outcome.stars_rms_arcsec, outcome.held_out_arcsec
+    stars = f"stars {stars_rms:.3g} arcsec rms, {outcome.stars_max_arcsec:.3g} maximum"
+    line = f"{outcome.model}: {stars}; held-out dots {held_out_rms:.3g} rms"
+    if outcome.stars_max_arcsec < FAIL_ARCSEC:
+        return line
+    return f"{line}; FAILS: over {FAIL_ARCSEC:g} arcsec"
 
 
 def ideal_arcsec() -> float:
     """How far stars are off with no calibration at all, rms over the screen."""
     nominal = _nominal()
-    return float(
-        np.sqrt(
-            (
-                _star_errors(
-                    Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])
-                )
-                ** 2
-            ).mean()
-        )
-    )
+    still = Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])
+    return float(np.sqrt(np.square(_star_errors(still)).mean()))
 
 
 def _nominal() -> Nominal:
@@ -311,42 +328,53 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
 
 
-def _draw(
+def draw(
     path: Path, finding: str, outcomes: list[CalibrationOutcome], uncalibrated_arcsec: float
 ) -> None:
-    note = (
-        f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames"
-        f" of {USUAL_SIZE[1]} dots"
+    """The errors of each model, by the number of centroids and by their noise."""
+    models = dict.fromkeys(outcome.model for outcome in outcomes)
+    labels = {name: SHORT.get(name, name) for name in models}
+    levels = (
+        LevelLine(uncalibrated_arcsec, "uncalibrated", style=":"),
+        LevelLine(FAIL_ARCSEC, "fails above"),
     )
-    note += f" with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
-    with chart(path, finding, panels=2, share_x=False, note=note) as (dots, noise):
-        for model, marker, colour in zip(MODELS, MARKERS, SERIES, strict=False):
-            mine = [o for o in outcomes if o.model == model.name]
-            by_dots = sorted(
-                (o.centroids, o.stars_rms_arcsec, o.held_out_arcsec)
-                for o in mine
-                if o.noise_px == USUAL_NOISE_PX
-            )
-            by_noise = sorted(
-                (o.noise_px, o.stars_rms_arcsec, o.held_out_arcsec)
-                for o in mine
-                if (o.frames, o.dots_per_frame) == USUAL_SIZE
-            )
-            for axes, rows in ((dots, by_dots), (noise, by_noise)):
-                places, stars, held = zip(*rows, strict=True)
-                axes.loglog(
-                    places,
-                    stars,
-                    marker=marker,
-                    color=colour,
-                    label=SHORT.get(model.name, model.name),
-                )
-                axes.loglog(places, held, ":", color=colour, lw=1.2, label="_held out")
-        for axes in (dots, noise):
-            axes.axhline(uncalibrated_arcsec, color=INK, ls=":", lw=1.2, label="uncalibrated")
-            axes.axhline(FAIL_ARCSEC, color=INK, ls="--", lw=1.2, label="fails above")
-            axes.set_ylabel("error, rms [arcsec]")
-            label_ends(axes)
-        dots.set_xlabel("centroids [number]")
-        noise.set_xlabel("noise of a centroid [px]")
-        plain_ticks(noise.xaxis, sorted({o.noise_px for o in outcomes}))
+    by_dots = PanelSpec(
+        lines_of("centroids", has_usual_noise),
+        "error, rms [arcsec]",
+        "centroids [number]",
+        levels=levels,
+        scales=("log", "log"),
+    )
+    by_noise = PanelSpec(
+        lines_of("noise_px", has_usual_size),
+        "error, rms [arcsec]",
+        "noise of a centroid [px]",
+        levels=levels,
+        scales=("log", "log"),
+        xticks=sorted({outcome.noise_px for outcome in outcomes}),
+    )
+    looks = looks_of(labels, MARKERS)
+    spec = ChartSpec(
+        (by_dots, by_noise), lambda row: row.model, looks, NOTE, layout={"share_x": False}
+    )
+    draw_rows(path, finding, spec, outcomes)
+
+
+def lines_of(x: str, where: Where) -> tuple[LineSpec, ...]:
+    """The errors of stars, and dotted those of dots that were held out, against `x`."""
+    stars = LineSpec(x, "stars_rms_arcsec", where=where)
+    dotted = {"lw": HELD_OUT_WIDTH}
+    held_out_dots = LineSpec(
+        x, "held_out_arcsec", ":", marker="", named=False, where=where, look=dotted
+    )
+    return stars, held_out_dots
+
+
+def has_usual_noise(outcome: CalibrationOutcome) -> bool:
+    """Whether only the dots of an outcome's frames are varied."""
+    return outcome.noise_px == USUAL_NOISE_PX
+
+
+def has_usual_size(outcome: CalibrationOutcome) -> bool:
+    """Whether only the noise of an outcome's centroids is varied."""
+    return (outcome.frames, outcome.dots_per_frame) == USUAL_SIZE

@@ -36,6 +36,13 @@ from hilstar.basics.charts import (
 )
 from hilstar.basics.units import LIGHT_M_S, flux_ratio, magnitude
 from hilstar.instruments.study.rapp import SENSORS, WEIGHTINGS, ChartFinding, rapp
+from hilstar.instruments.study.row_charts import (
+    CurvePanel,
+    PanelSpec,
+    draw_curve_panel,
+    draw_curves,
+    write_columns,
+)
 from hilstar.instruments.study.settings import (
     APERTURE_MM,
     MAX_RELIABLE_VI_MAG,
@@ -295,16 +302,11 @@ def passbands(directory: Path) -> ChartFinding:
                 ha="center",
                 color=colour,
             )
-        for (name, values), colour in zip(shown.items(), (INK, ORANGE), strict=True):
-            lower.plot(nm, values, color=colour, label=name)
         upper.set(ylabel="response [1]", ylim=(0, 1.15))
-        lower.set(xlabel="wavelength [nm]", ylabel="relative F_lambda [1]")
-        lower.legend()
-    write_csv(
-        directory / "vega.csv",
-        ("wavelength_nm", "vega", "blackbody_9602_k"),
-        np.column_stack((nm, *shown.values())),
-    )
+        spec = PanelSpec((), "relative F_lambda [1]", "wavelength [nm]", legend={})
+        draw_curve_panel(lower, CurvePanel(nm, shown, spec, (INK, ORANGE)))
+    columns_nm = {"wavelength_nm": nm, "vega": shown["Vega"], "blackbody_9602_k": body}
+    write_columns(directory / "vega.csv", columns_nm)
     return ChartFinding("passbands", text)
 
 
@@ -329,22 +331,17 @@ def curves(directory: Path) -> ChartFinding:
     bodies = [blackbody_exitance_w_m2_m(nm, each) for each in kelvin]
     bodies = [each / each.max() for each in bodies]
     v = load_curve("johnson-v", "johnson-v").wavelength_nm
+    of_sensors = {name: curve(nm) for name, curve in loaded.items()}
+    of_bodies = {f"{each:.0f} K": body for each, body in zip(kelvin, bodies, strict=True)}
+    edges = PanelSpec((), "exitance over its largest [1]", "wavelength [nm]")
     with chart(directory / "curves", text, panels=2, note=note) as (upper, lower):
-        for (name, curve), colour in zip(loaded.items(), SERIES, strict=False):
-            upper.plot(nm, curve(nm), color=colour, label=name)
-        for each, body, colour in zip(kelvin, bodies, SERIES, strict=False):
-            lower.plot(nm, body, color=colour, label=f"{each:.0f} K")
+        spec = PanelSpec((), "electrons a photon, transmission [1]")
+        draw_curve_panel(upper, CurvePanel(nm, of_sensors, spec))
+        draw_curve_panel(lower, CurvePanel(nm, of_bodies, edges))
         for edge in (v[0], v[-1]):
             lower.axvline(edge, color=MUTED, lw=1)
-        upper.set(ylabel="electrons a photon, transmission [1]")
-        lower.set(xlabel="wavelength [nm]", ylabel="exitance over its largest [1]")
-        label_ends(upper, lower)
-    table = np.column_stack((nm, *(curve(nm) for curve in loaded.values()), *bodies))
-    write_csv(
-        directory / "curves.csv",
-        ("wavelength_nm", *names, *(f"blackbody_{each:.0f}_k" for each in kelvin)),
-        table,
-    )
+    columns = {f"blackbody_{each:.0f}_k": body for each, body in zip(kelvin, bodies, strict=True)}
+    write_columns(directory / "curves.csv", {"wavelength_nm": nm, **of_sensors, **columns})
     return ChartFinding("curves", text)
 
 
@@ -383,22 +380,12 @@ def detector_laws(directory: Path) -> ChartFinding:
         "e2v's constants were seen in public code, not on a data sheet. Read noise: 2 e- at 1 MHz,"
         " white and 1/f noise."
     )
-    with chart(directory / "detector_laws", text, panels=2, note=note, share_x=False) as (
-        upper,
-        lower,
-    ):
-        for (name, values), colour in zip(dark.items(), SERIES, strict=False):
-            upper.semilogy(kelvin, values, color=colour, label=name)
-        for (corner, values), colour in zip(read.items(), SERIES, strict=False):
-            lower.loglog(hz, values, color=colour, label=f"1/f corner {corner / 1e3:g} kHz")
-        upper.set(xlabel="temperature [K]", ylabel="dark current [e-/s]")
-        lower.set(xlabel="readout frequency [Hz]", ylabel="read noise [e-]")
-        label_ends(upper, lower)
-    write_csv(
-        directory / "detector_laws.csv",
-        ("temperature_k", *dark),
-        np.column_stack((kelvin, *dark.values())),
-    )
+    upper = PanelSpec((), "dark current [e-/s]", "temperature [K]", scales=("linear", "log"))
+    lower = PanelSpec((), "read noise [e-]", "readout frequency [Hz]", scales=("log", "log"))
+    by_corner = {f"1/f corner {corner / 1e3:g} kHz": noise for corner, noise in read.items()}
+    panels = CurvePanel(kelvin, dark, upper), CurvePanel(hz, by_corner, lower)
+    draw_curves(directory / "detector_laws", text, panels, note)
+    write_columns(directory / "detector_laws.csv", {"temperature_k": kelvin, **dark})
     return ChartFinding("detector_laws", text)
 
 
@@ -428,16 +415,10 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
         f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The"
         " WFC3 handbook's spectrum, V = 22.15, gives 101.6."
     )
-    with chart(directory / "zodiacal", text, note=note) as (axes,):
-        for (name, values), colour in zip(spectra.items(), SERIES, strict=False):
-            axes.plot(nm, values, color=colour, label=f"{name}: {total[name]:.1f} in all")
-        axes.set(xlabel="wavelength [nm]", ylabel="photons/s/m2/arcsec2/nm")
-        axes.legend()
-    write_csv(
-        directory / "zodiacal.csv",
-        ("wavelength_nm", *spectra),
-        np.column_stack((nm, *spectra.values())),
-    )
+    with_totals = {f"{name}: {total[name]:.1f} in all": light for name, light in spectra.items()}
+    spec = PanelSpec((), "photons/s/m2/arcsec2/nm", "wavelength [nm]", legend={})
+    draw_curves(directory / "zodiacal", text, (CurvePanel(nm, with_totals, spec),), note)
+    write_columns(directory / "zodiacal.csv", {"wavelength_nm": nm, **spectra})
     return ChartFinding("zodiacal", text)
 
 

@@ -21,17 +21,7 @@ import numpy as np
 
 from hilstar.attitude.clock.timeline import Policy, Prediction, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.basics.charts import (
-    BLUE,
-    GREEN,
-    MUTED,
-    ORANGE,
-    SERIES,
-    chart,
-    label_ends,
-    plain_ticks,
-    write_records,
-)
+from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, write_records
 from hilstar.basics.rotation import (
     angle_between_rad,
     conjugate,
@@ -52,6 +42,16 @@ from hilstar.instruments.study.predictors import (
     slew_attitude,
     slew_sample,
 )
+from hilstar.instruments.study.row_charts import (
+    HIDDEN,
+    ChartSpec,
+    LevelLine,
+    LineSpec,
+    PanelSpec,
+    SeriesLook,
+    draw_rows,
+    looks_of,
+)
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
@@ -71,6 +71,12 @@ SHAKEN_CELLS = ((20, 40), (50, 20), (100, 5), (100, 10), (100, 20), (100, 40), (
 QUICK_SHAKEN_CELLS = ((100, 20),)
 SHAKEN_ARCSEC, SHAKEN_TURN_RAD_S = 2.0, math.radians(0.5)
 SETTLED_S, SHAKEN_S = 1.5, 3.0
+SHAKEN_TICKS_HZ = (1, 2, 5, 10, 20, 45)
+SHAKEN_LOOK = {"markersize": 3.5}
+SENDERS = ("with rates", "without rates")
+# The labels of their panels' y axes: one stands for both.
+ERROR_LABELS = dict(zip(SENDERS, ("error, rms / vibration's rms", ""), strict=True))
+GAIN_LABELS = dict(zip(SENDERS, ("amplitude shown / true", ""), strict=True))
 SHAKEN_FRAME_HZ = 59.94  # no multiple of the packets' rate or of a vibration: every phase comes
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -115,7 +121,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is"
         f" off by {default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
-    _draw(directory / "prediction", finding, outcomes, load)
+    draw(directory / "prediction", finding, outcomes, load)
     cells, frequencies = (
         (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
     )
@@ -128,16 +134,13 @@ def run(directory: Path, quick: bool = False) -> Judged:
             packets = "with rates" if rates else "without rates"
             shaken_by.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
     write_records(directory / "prediction_jitter.csv", shaken_by)
-    given, derived = (
-        crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS)
-        for packets in ("with rates", "without rates")
-    )
+    given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in SENDERS)
     told = (
         f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
         " nearer than one predicted by"
         f' {USUAL_MS} ms; "auto" is within {auto_times(shaken_by):.1f} times the better of both'
     )
-    _draw_shaken(directory / "prediction_jitter", told, shaken_by)
+    draw_shaken(directory / "prediction_jitter", told, shaken_by)
     lines = (
         f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
         f" {o.attitude_us:.0f} us per attitude"
@@ -257,70 +260,99 @@ def _outcome(
     )
 
 
-def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
+def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
+    """The pointing error of each predictor, by latency and by the rate of packets."""
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     note = (
         f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the"
         " time of one attitude."
     )
-    with chart(path, finding, panels=2, share_x=False, note=load.note(note)) as (latency, rate):
-        for name, marker, colour in zip(
-            dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False
-        ):
-            mine = [o for o in outcomes if o.method == name]
-            took_us = np.median([o.attitude_us for o in mine])
-            by_latency = sorted((o.latency_ms, o.rms_arcsec) for o in mine if o.rate_hz == USUAL_HZ)
-            by_rate = sorted((o.rate_hz, o.rms_arcsec) for o in mine if o.latency_ms == USUAL_MS)
-            latency.loglog(
-                *zip(*by_latency, strict=True),
-                marker=marker,
-                color=colour,
-                label=f"{name} ({took_us:.0f} us)",
-            )
-            rate.loglog(*zip(*by_rate, strict=True), marker=marker, color=colour, label=name)
-        latency.set_xlabel(f"latency [ms], packets at {USUAL_HZ} Hz")
-        rate.set_xlabel(f"rate of packets [Hz], latency {USUAL_MS} ms")
-        plain_ticks(latency.xaxis, LATENCIES_MS)
-        plain_ticks(rate.xaxis, RATES_HZ)
-        for axes in (latency, rate):
-            axes.set_ylabel("pointing error, rms [arcsec]")
-            label_ends(axes)
+    labels = {outcome.method: outcome.method for outcome in outcomes}
+    with_times = {}
+    for name in labels:
+        took_us = [outcome.attitude_us for outcome in outcomes if outcome.method == name]
+        with_times[name] = f"{name} ({np.median(took_us):.0f} us)"
+    error = "pointing error, rms [arcsec]"
+    by_latency = PanelSpec(
+        (
+            LineSpec(
+                "latency_ms",
+                "rms_arcsec",
+                label=lambda outcome: with_times[outcome.method],
+                where=lambda outcome: outcome.rate_hz == USUAL_HZ,
+            ),
+        ),
+        error,
+        f"latency [ms], packets at {USUAL_HZ} Hz",
+        scales=("log", "log"),
+        xticks=LATENCIES_MS,
+    )
+    by_rate = PanelSpec(
+        (LineSpec("rate_hz", "rms_arcsec", where=lambda outcome: outcome.latency_ms == USUAL_MS),),
+        error,
+        f"rate of packets [Hz], latency {USUAL_MS} ms",
+        scales=("log", "log"),
+        xticks=RATES_HZ,
+    )
+    spec = ChartSpec(
+        (by_latency, by_rate),
+        lambda outcome: outcome.method,
+        looks_of(labels, MARKERS),
+        note,
+        layout={"share_x": False},
+    )
+    draw_rows(path, finding, spec, outcomes, load)
 
 
-def _draw_shaken(path: Path, finding: str, found: list[Shaken]) -> None:
+def draw_shaken(path: Path, finding: str, shaken: list[Shaken]) -> None:
+    """A vibration's error and amplitude as shown, by its frequency; with and without rates."""
     note = (
         f"Packets at {USUAL_HZ} Hz, the newest {USUAL_MS} ms old at light on the mean; a vibration"
         f" of {SHAKEN_ARCSEC:g} arcsec beside a turn of {math.degrees(SHAKEN_TURN_RAD_S):g} deg/s."
         " Error and amplitude as shares of the vibration's own."
     )
-    with chart(path, finding, panels=2, columns=2, note=note, share_y="row") as axes:
-        for column, packets in enumerate(("with rates", "without rates")):
-            error, gain = axes[column], axes[2 + column]
-            for way, colour in WAYS.items():
-                mine = [
-                    s
-                    for s in found
-                    if (s.way, s.packets, s.packet_hz, s.age_ms)
-                    == (way, packets, USUAL_HZ, USUAL_MS)
-                ]
-                hz = [s.jitter_hz for s in mine]
-                error.semilogx(
-                    hz,
-                    [s.residual for s in mine],
-                    marker="o",
-                    markersize=3.5,
-                    color=colour,
-                    label=way,
-                )
-                gain.semilogx(
-                    hz, [s.gain for s in mine], marker="o", markersize=3.5, color=colour, label=way
-                )
-            error.set_title(f"packets {packets}")
-            gain.axhline(1.0, color=MUTED, linewidth=0.8)
-            gain.set_xlabel("frequency of the vibration [Hz]")
-            for panel in (error, gain):
-                panel.set_ylim(bottom=0)
-                plain_ticks(panel.xaxis, (1, 2, 5, 10, 20, 45))
-        axes[0].set_ylabel("error, rms / vibration's rms")
-        axes[2].set_ylabel("amplitude shown / true")
-        label_ends(axes[1], axes[3])
+    usual = [row for row in shaken if (row.packet_hz, row.age_ms) == (USUAL_HZ, USUAL_MS)]
+    looks = {way: SeriesLook(way, colour, "o") for way, colour in WAYS.items()}
+    panels = (
+        *(error_panel(packets) for packets in SENDERS),
+        *(gain_panel(packets) for packets in SENDERS),
+    )
+    layout = {"share_y": "row"}
+    draw_rows(path, finding, ChartSpec(panels, way_of, looks, note, 2, layout), usual)
+
+
+def error_panel(packets: str) -> PanelSpec:
+    """The error of a vibration, by its frequency, from one kind of sender."""
+    return PanelSpec(
+        (shaken_line("residual", packets),),
+        ERROR_LABELS[packets],
+        title=f"packets {packets}",
+        scales=("log", "linear"),
+        xticks=SHAKEN_TICKS_HZ,
+        from_zero=True,
+        names=packets != SENDERS[0],
+    )
+
+
+def gain_panel(packets: str) -> PanelSpec:
+    """The amplitude of a vibration as shown, by its frequency, from one kind of sender."""
+    return PanelSpec(
+        (shaken_line("gain", packets),),
+        GAIN_LABELS[packets],
+        "frequency of the vibration [Hz]",
+        levels=(LevelLine(1.0, HIDDEN, MUTED, "-", 0.8),),
+        scales=("log", "linear"),
+        xticks=SHAKEN_TICKS_HZ,
+        from_zero=True,
+        names=packets != SENDERS[0],
+    )
+
+
+def shaken_line(share: str, packets: str) -> LineSpec:
+    """A share of a vibration's own against its frequency, of one kind of sender."""
+    return LineSpec("jitter_hz", share, where=lambda row: row.packets == packets, look=SHAKEN_LOOK)
+
+
+def way_of(row: Shaken) -> str:
+    """The series of a row: its way of prediction."""
+    return row.way

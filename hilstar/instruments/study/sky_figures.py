@@ -15,14 +15,13 @@ from hilstar.basics.charts import (
     PURPLE,
     SMALL_PT,
     chart,
-    label_ends,
-    plain_ticks,
     write_csv,
 )
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S, flux_ratio
 from hilstar.instruments.study.fields import FIELDS
 from hilstar.instruments.study.rapp import ChartFinding
+from hilstar.instruments.study.row_charts import CurvePanel, PanelSpec, draw_curves, write_columns
 from hilstar.sky.air import NIGHT_SKY
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import REFERENCE_TEMPERATURE_K, SUN_TEMPERATURE_K, load_library
@@ -53,6 +52,14 @@ EARTHSHINES = {
     "earthshine, 38°": 1.0,
     "earthshine, 50°": 0.5,
 }  # by degrees from the Earth's limb
+LIGHT_COLOURS = (BLUE, MUTED, GREEN, PURPLE, ORANGE)
+LIGHT_COLUMNS = (
+    "zodiacal",
+    "earthshine_24_deg",
+    "earthshine_38_deg",
+    "earthshine_50_deg",
+    "ground",
+)
 W_M2_M_OF_ERG = 1e7  # erg/s/cm2/A in W/m2/m
 
 
@@ -91,8 +98,12 @@ def star_density(directory: Path) -> ChartFinding:
         axes.figure.colorbar(image, ax=axes, label="Stars a square degree")
     middles = (across[:-1] + across[1:]) / 2, np.degrees(np.arcsin((down[:-1] + down[1:]) / 2))
     ra_deg, dec_deg = np.meshgrid(*middles)
-    table = np.column_stack((ra_deg.ravel(), dec_deg.ravel(), density.ravel()))
-    write_csv(directory / "star_density.csv", ("ra_deg", "dec_deg", "stars_deg2"), table.tolist())
+    columns = {
+        "ra_deg": ra_deg.ravel(),
+        "dec_deg": dec_deg.ravel(),
+        "stars_deg2": density.ravel(),
+    }
+    write_columns(directory / "star_density.csv", columns)
     return ChartFinding("star_density", text)
 
 
@@ -184,15 +195,16 @@ def sun(directory: Path) -> ChartFinding:
     note = (
         "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
     )
-    with chart(directory / "sun", text, note=note) as (axes,):
-        axes.plot(SHOWN_NM, spectrum(SHOWN_NM), color=INK, label=f"{SUN_TYPE}, observed")
-        axes.plot(
-            SHOWN_NM, body(SHOWN_NM), color=ORANGE, label=f"black body, {SUN_TEMPERATURE_K:.0f} K"
-        )
-        axes.set(xlabel="wavelength [nm]", ylabel="F_lambda over its mean in V [1]")
-        axes.legend()
-    table = np.column_stack((SHOWN_NM, spectrum(SHOWN_NM), body(SHOWN_NM)))
-    write_csv(directory / "sun.csv", ("wavelength_nm", "g2v", "blackbody"), table.tolist())
+    observed, shown_body = spectrum(SHOWN_NM), body(SHOWN_NM)
+    curves = {
+        f"{SUN_TYPE}, observed": observed,
+        f"black body, {SUN_TEMPERATURE_K:.0f} K": shown_body,
+    }
+    spec = PanelSpec((), "F_lambda over its mean in V [1]", "wavelength [nm]", legend={})
+    panel = CurvePanel(SHOWN_NM, curves, spec, (INK, ORANGE))
+    draw_curves(directory / "sun", text, (panel,), note)
+    columns = {"wavelength_nm": SHOWN_NM, "g2v": observed, "blackbody": shown_body}
+    write_columns(directory / "sun.csv", columns)
     return ChartFinding("sun", text)
 
 
@@ -213,16 +225,19 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
         f" {red:.2f} at 5 micrometres"
     )
     note = f"CALSPEC, scaled to V = 0. Black body: {REFERENCE_TEMPERATURE_K:.0f} K, scaled in V."
-    with chart(directory / "vega_logarithmic", text, note=note) as (axes,):
-        axes.loglog(nm, flux, color=INK, label="Vega")
-        axes.loglog(nm, body, color=ORANGE, label="black body")
-        axes.set(xlabel="wavelength [nm]", ylabel="F_lambda [W/m2/m]", xlim=VEGA_NM)
-        plain_ticks(axes.xaxis, VEGA_TICKS_NM)
-        axes.legend()
-    table = np.column_stack((nm, flux, body))
-    write_csv(
-        directory / "vega_logarithmic.csv", ("wavelength_nm", "vega", "blackbody"), table.tolist()
+    spec = PanelSpec(
+        (),
+        "F_lambda [W/m2/m]",
+        "wavelength [nm]",
+        scales=("log", "log"),
+        xlim=VEGA_NM,
+        xticks=VEGA_TICKS_NM,
+        legend={},
     )
+    panel = CurvePanel(nm, {"Vega": flux, "black body": body}, spec, (INK, ORANGE))
+    draw_curves(directory / "vega_logarithmic", text, (panel,), note)
+    columns = {"wavelength_nm": nm, "vega": flux, "blackbody": body}
+    write_columns(directory / "vega_logarithmic.csv", columns)
     return ChartFinding("vega_logarithmic", text)
 
 
@@ -247,18 +262,11 @@ def backgrounds(directory: Path) -> ChartFinding:
         f" {GLOW_V_MAG:g}, zodiacal"
         " light within it. The geocoronal lines lie under 250 nm."
     )
-    colours = (BLUE, MUTED, GREEN, PURPLE, ORANGE)
-    with chart(directory / "backgrounds", text, note=note) as (axes,):
-        for (name, values), colour in zip(lights.items(), colours, strict=True):
-            axes.semilogy(SHOWN_NM, values, color=colour, lw=1.5, label=name)
-        axes.set(xlabel="wavelength [nm]", ylabel="photons/s/m2/arcsec2/nm")
-        label_ends(axes)
-    names = ("zodiacal", "earthshine_24_deg", "earthshine_38_deg", "earthshine_50_deg", "ground")
-    write_csv(
-        directory / "backgrounds.csv",
-        ("wavelength_nm", *names),
-        np.column_stack((SHOWN_NM, *lights.values())).tolist(),
-    )
+    spec = PanelSpec((), "photons/s/m2/arcsec2/nm", "wavelength [nm]", scales=("linear", "log"))
+    panel = CurvePanel(SHOWN_NM, lights, spec, LIGHT_COLOURS, {"lw": 1.5})
+    draw_curves(directory / "backgrounds", text, (panel,), note)
+    columns = dict(zip(LIGHT_COLUMNS, lights.values(), strict=True))
+    write_columns(directory / "backgrounds.csv", {"wavelength_nm": SHOWN_NM, **columns})
     return ChartFinding("backgrounds", text)
 
 

@@ -10,7 +10,7 @@ import os
 import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -130,104 +130,6 @@ def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
     on the front.
     """
     return np.asarray(~beaten_by(errors, times_ms).any(axis=1))
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A measure of methods: its name and unit; figures under `floor` count as 0."""
-
-    name: str
-    unit: str
-    floor: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """A method: its error and a second figure, in the units of its `Trials`, and the work that is
-    timed.
-
-    `more` are further figures by the names of their columns. The others are measured against the
-    exact one. `measured` adds the median time and its quartiles, ms; `on_front` where no other is
-    both as accurate and as fast; and in `beaten` the method that beats the default, and why the
-    default stays.
-    """
-
-    method: str
-    error: float
-    second: float
-    work: Callable[[], object]
-    is_default: bool = False
-    is_exact: bool = False
-    more: dict[str, float] = field(default_factory=dict)
-    time_ms: float = np.nan
-    quartiles_ms: tuple[float, float] = (np.nan, np.nan)
-    on_front: bool = False
-    beaten: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Trials:
-    """All methods of a step. `work` names the timed work, `why_default` is the reason for the
-    default where another beats it.
-
-    `remark` is a caution that the figures alone would hide. `load` is what others took while it was
-    timed.
-    """
-
-    name: str
-    work: str
-    error: Figure
-    second: Figure
-    why_default: str
-    trials: Sequence[Trial]
-    remark: str = ""
-    load: Load = field(default_factory=Load)
-
-    @property
-    def default(self) -> Trial:
-        """The method that hilstar takes."""
-        return next(trial for trial in self.trials if trial.is_default)
-
-
-def measured(step: Trials, budget_s: float) -> Trials:
-    """Time the methods of a step in turn, mark the front, and put the fastest first.
-
-    On a busy machine no method is on the front, and none is said to beat the default.
-    """
-    others = OtherWork()
-    works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
-    times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
-    low, middle, high = np.array(
-        [np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]
-    ).T
-    load = others.load()
-    errors = [max(trial.error, step.error.floor) for trial in step.trials]
-    # On a busy machine every method counts as beaten: none is on the front.
-    beaten = beaten_by(errors, middle) | load.busy
-    found = [
-        replace(
-            trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any()
-        )
-        for trial, q1, ms, q3, beats in zip(step.trials, low, middle, high, beaten, strict=True)
-    ]
-    own = next(k for k, trial in enumerate(found) if trial.is_default)
-    if not found[own].on_front and not load.busy:
-        best = min(
-            (trial for trial, beats in zip(found, beaten[own], strict=True) if beats),
-            key=lambda trial: trial.time_ms,
-        )
-        saved = 100 * (1 - best.time_ms / found[own].time_ms)
-        noise = (
-            ", and the quartiles of both overlap"
-            if best.quartiles_ms[1] >= found[own].quartiles_ms[0]
-            else ""
-        )
-        why = (
-            f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise};"
-            f" {step.why_default}"
-        )
-        found[own] = replace(found[own], beaten=why)
-    return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms), load=load)
 
 
 class OtherWork:

@@ -22,7 +22,7 @@ import numpy as np
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import SERIES, chart, label_ends, plain_ticks, write_records
+from hilstar.basics.charts import plain_ticks, write_records
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
@@ -35,6 +35,14 @@ from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
 from hilstar.instruments.simulate.shutter import S_PER_US
 from hilstar.instruments.study import settings
 from hilstar.instruments.study.predictors import Movement, attitude_at
+from hilstar.instruments.study.row_charts import (
+    ChartSpec,
+    LineSpec,
+    PanelSpec,
+    draw_rows,
+    looks_of,
+    row_panels,
+)
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.exposure_motion import Motion, smeared_sprites
 from hilstar.optics.frame_motion import Scan
@@ -50,6 +58,25 @@ STRIPE_ROWS, ROW_TIME_US, REFRESH_HZ = 1024, 60.0, 60.0
 STRIPE_SIZE_PX = (128, STRIPE_ROWS)
 EVERY_ROWS = 16  # between dots
 ROUNDING = 1e-9
+STRIPE_NOTE = (
+    f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each,"
+    " the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
+)
+STRIPE_PANEL = PanelSpec(
+    (
+        LineSpec("row", "foretold"),
+        LineSpec("row", "light", "", marker="o", named=False, look={"ms": 3}),
+    ),
+    "light / mean light",
+    "row of the tracker",
+    from_zero=True,
+    legend={
+        "loc": "upper center",
+        "bbox_to_anchor": (0.5, -0.16),
+        "ncols": 2,
+        "frameon": False,
+    },
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,32 +189,31 @@ def draw_stripes(path: Path, points: list[StripePoint]) -> str:
         f" {100 * whole:.0f} % where exposures are whole refreshes: as foretold within"
         f" {max(off, ROUNDING):.0e}"
     )
-    note = (
-        f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us"
-        " each, the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
-    )
-    with chart(path, finding, note=note) as (axes,):
-        for case, colour in zip(STRIPE_CASES, SERIES, strict=False):
-            mine = [
-                point
-                for point in points
-                if (point.refreshes, point.lit_ms) == (case.refreshes, case.lit_ms)
-            ]
-            rows = [point.row for point in mine]
-            axes.plot(rows, [point.foretold for point in mine], color=colour, label=case.words)
-            axes.plot(rows, [point.light for point in mine], "o", ms=3, color=colour, label="_seen")
-        axes.set_ylabel("light / mean light")
-        axes.set_xlabel("row of the tracker")
-        axes.set_ylim(bottom=0)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
+    looks = looks_of({case: case.words for case in STRIPE_CASES})
+    draw_rows(path, finding, ChartSpec((STRIPE_PANEL,), stripe_case, looks, STRIPE_NOTE), points)
     return finding
+
+
+def stripe_case(point: StripePoint) -> StripeCase:
+    """The case of a row: the series of its chart."""
+    return StripeCase(point.refreshes, point.lit_ms)
 
 
 RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
 PACKET_HZ = 200
 RATE_DEG_S = 1.0
+BEAT_PHASES = 801  # of the lines that are foretold
+BEAT_NOTE = (
+    "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit"
+    " have no beat."
+)
+TIMING_NOTE = (
+    "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to"
+    " the one above it."
+)
 PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
+MARKERS = "osd^"
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
 ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
@@ -469,7 +495,7 @@ def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
         f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from"
         f" their phase, within {_off_arcsec(points):.2g} arcsec rms"
     )
-    _draw(directory / "beat", finding, cases)
+    draw_beat(directory / "beat", finding, cases)
     lines = []
     for case, mine in cases.items():
         found = beat(case.exposures)
@@ -487,42 +513,59 @@ def _off_arcsec(points: list[BeatPoint]) -> float:
     return float(np.sqrt(np.mean([(p.off_arcsec - p.foretold_arcsec) ** 2 for p in points])))
 
 
-def _draw(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) -> None:
-    phases = np.linspace(0, 1, 801)
-    note = (
-        "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit"
-        " have no beat."
+def draw_beat(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) -> None:
+    """Shift and light of stars by the phase of their exposure, and as they are foretold."""
+    rows: list[BeatPoint | ForetoldBeat] = []
+    for case, points in cases.items():
+        rows += [*foretold_beat(case), *points]
+    place = PanelSpec(
+        beat_lines("off_arcsec"), "shift of its place [arcsec]", scales=("linear", "symlog")
     )
-    with chart(path, finding, panels=2, note=note) as (place, light):
-        for (case, mine), colour in zip(cases.items(), SERIES, strict=False):
-            foretold = seen_at(case.exposures, phases)
-            place.plot(
-                phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words
-            )
-            light.plot(
-                phases,
-                [magnitude(float(part)) for part in foretold.light],
-                color=colour,
-                label=case.words,
-            )
-            for axes, seen in ((place, "off_arcsec"), (light, "light_mag")):
-                axes.plot(
-                    [p.phase for p in mine],
-                    [getattr(p, seen) for p in mine],
-                    "o",
-                    ms=3.5,
-                    color=colour,
-                    label="_seen",
-                )
-        place.set_ylabel("shift of its place [arcsec]")
-        place.set_yscale("symlog", linthresh=1.0)
-        plain_ticks(
-            place.yaxis,
-            [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))],
-        )
-        light.set_ylabel("change of its light [mag]")
-        light.set_xlabel("start of the exposure after a row lights [refreshes]")
-        label_ends(place, light)
+    light = PanelSpec(
+        beat_lines("light_mag"),
+        "change of its light [mag]",
+        "start of the exposure after a row lights [refreshes]",
+    )
+    looks = looks_of({case: case.words for case in cases})
+    spec = ChartSpec((place, light), beat_case, looks, BEAT_NOTE)
+    with row_panels(path, finding, spec, rows) as panels:
+        reach_arcsec = max(map(abs, panels[0].get_ylim()))
+        ticks = [tick for tick in PLACE_TICKS if abs(tick) <= reach_arcsec]
+        plain_ticks(panels[0].yaxis, ticks)
+
+
+@dataclass(frozen=True, slots=True)
+class ForetoldBeat:
+    """What a phase of the exposure does to a star, by `run.sync`; columns as BeatPoint's."""
+
+    refreshes: float
+    lit: float
+    phase: float
+    off_arcsec: float
+    light_mag: float
+
+
+def foretold_beat(case: TimingCase) -> list[ForetoldBeat]:
+    """A case at every phase."""
+    phases = np.linspace(0, 1, BEAT_PHASES)
+    foretold = seen_at(case.exposures, phases)
+    off_arcsec = foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG
+    rows = []
+    for phase, off, light in zip(phases, off_arcsec, foretold.light, strict=True):
+        mag = magnitude(float(light))
+        rows.append(ForetoldBeat(case.refreshes, case.lit, float(phase), float(off), mag))
+    return rows
+
+
+def beat_lines(y: str) -> tuple[LineSpec, ...]:
+    """Lines of what is foretold, and dots of stars, against the phase."""
+    dots = LineSpec("phase", y, "", marker="o", named=False, of=BeatPoint, look={"ms": 3.5})
+    return LineSpec("phase", y, of=ForetoldBeat), dots
+
+
+def beat_case(row: BeatPoint | ForetoldBeat) -> TimingCase:
+    """The case of a row: the series of its chart."""
+    return TimingCase(row.refreshes, row.lit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -613,20 +656,22 @@ def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:
         f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction"
         f" alone, and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
     )
-    note = (
-        "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way"
-        " adds to the one above it."
+    rates = sorted({outcome.rate_deg_s for outcome in outcomes})
+    error = PanelSpec(
+        (LineSpec("rate_deg_s", "rms_arcsec"),),
+        "error of star positions, rms [arcsec]",
+        scales=("log", "log"),
     )
-    with chart(path, finding, panels=2, note=load.note(note), heights=(1.5, 1)) as (error, cost):
-        for way, marker in zip(WAYS, "osd^", strict=True):
-            mine = [o for o in outcomes if o.way == way]
-            rates = [o.rate_deg_s for o in mine]
-            error.loglog(rates, [o.rms_arcsec for o in mine], marker=marker, label=way)
-            cost.semilogx(rates, [o.draw_ms for o in mine], marker=marker, label=way)
-        error.set_ylabel("error of star positions, rms [arcsec]")
-        cost.set_ylabel("time of a frame [ms]")
-        cost.set_ylim(bottom=0)
-        cost.set_xlabel("slew rate [deg/s]")
-        plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))
-        label_ends(error, cost)
+    cost = PanelSpec(
+        (LineSpec("rate_deg_s", "draw_ms"),),
+        "time of a frame [ms]",
+        "slew rate [deg/s]",
+        scales=("log", "linear"),
+        xticks=rates,
+        from_zero=True,
+    )
+    looks = looks_of({way: way for way in WAYS}, MARKERS)
+    layout = {"heights": (1.5, 1)}
+    spec = ChartSpec((error, cost), lambda row: row.way, looks, TIMING_NOTE, layout=layout)
+    draw_rows(path, finding, spec, outcomes, load)
     return finding

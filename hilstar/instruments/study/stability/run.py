@@ -3,7 +3,7 @@ reason; charts of curves.
 """
 
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,14 +18,39 @@ from hilstar.basics.charts import (
     ORANGE,
     PURPLE,
     chart,
-    label_ends,
-    plain_ticks,
     two_digits,
     write_csv,
 )
 from hilstar.basics.files import write_whole
 from hilstar.basics.units import magnitude
+from hilstar.instruments.study.row_charts import (
+    HIDDEN,
+    CurvePanel,
+    PanelSpec,
+    draw_curve_panel,
+    draw_curves,
+    write_columns,
+)
 from hilstar.instruments.study.stability import COLUMNS, FailureCase, image, recorded
+
+SIGMA_TICKS_PX = (0.1, 0.2, 0.3, 0.5, 0.85, 1.2, 2)
+FIELD_TICKS_DEG = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60)
+TURN_TICKS_DEG, HALF_TURN_DEG = (0, 60, 120, 180, 240, 300, 360), 180
+SMALLEST_ARCSEC = 1e-12  # as drawn
+THIN = {"lw": 1.0}
+NARROW_NOTE = (
+    "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a wide"
+    " sampled star's pixels cancel in its sums, here in float64 and without an end; hilstar draws"
+    " in float32, and its sprites end."
+)
+WEAK_NOTE = (
+    "With the demo's lens and monitor. Perspective proper, as hilstar has it, has no such error."
+)
+POPPING_NOTE = (
+    f"A star {image.CODES_MAG_UNDER_WHITE:g} mag under white, {image.CODES_BITS} bits, sigma"
+    f" {image.SIGMA_PX:g} px, {image.STEPS} steps; it moves in y by"
+    f" {image.PATH_PX[1] / image.PATH_PX[0]:.2f} of its way in x."
+)
 
 # In the order of the light's way, between the recorded cases of catalogue and geometry and those of
 # detector and attitude.
@@ -72,25 +97,16 @@ def narrow_sigmas(directory: Path) -> None:
     sampled_columns = ("sampled_flux_error", "sampled_centroid_error_px", "sampled_peak_error")
     rows = np.column_stack([sigmas_px, errors]).tolist()
     write_csv(directory / "narrow_stars.csv", (*columns, *sampled_columns), rows)
-    note = (
-        "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a"
-        " wide sampled star's pixels"
-    )
-    note += (
-        " cancel in its sums, here in float64 and without an end; hilstar draws in float32, and its"
-        " sprites end."
-    )
+    labels = "flux error [share]", "place error [px]", "middle pixel's error [share]"
+    panels = []
+    for label, points, integrated in zip(labels, np.abs(sampled), np.abs(ours), strict=True):
+        curves = {"sampled": points, "integrated (hilstar)": integrated}
+        spec = PanelSpec((), label, scales=("log", "log"))
+        panels.append(CurvePanel(sigmas_px, curves, spec, (ORANGE, BLUE)))
+    last = replace(panels[-1].spec, xlabel="sigma of the star [px]", xticks=SIGMA_TICKS_PX)
+    panels[-1] = replace(panels[-1], spec=last)
     finding = narrow_finding(sigmas_px, ours, sampled)
-    with chart(directory / "narrow_stars", finding, panels=3, note=note) as panels:
-        for axes, points, integrated in zip(panels, np.abs(sampled), np.abs(ours), strict=True):
-            axes.loglog(sigmas_px, points, color=ORANGE, label="sampled")
-            axes.loglog(sigmas_px, integrated, color=BLUE, label="integrated (hilstar)")
-        panels[0].set_ylabel("flux error [share]")
-        panels[1].set_ylabel("place error [px]")
-        panels[2].set_ylabel("middle pixel's error [share]")
-        panels[-1].set_xlabel("sigma of the star [px]")
-        plain_ticks(panels[-1].xaxis, (0.1, 0.2, 0.3, 0.5, 0.85, 1.2, 2))
-        label_ends(*panels)
+    draw_curves(directory / "narrow_stars", finding, panels, NARROW_NOTE)
 
 
 def narrow_finding(sigmas_px: FloatArray, ours: FloatArray, sampled: FloatArray) -> str:
@@ -120,16 +136,20 @@ def weak_perspectives(directory: Path) -> None:
         f" {abs(at_arcsec):.0f} arcsec ten degrees from the axis, and by {abs(half_px / at_px):.2f}"
         " of that at five"
     )
-    note = (
-        "With the demo's lens and monitor. Perspective proper, as hilstar has it, has no such"
-        " error."
+    above = PanelSpec((), "error [monitor px]", scales=("log", "log"), names=False)
+    below = PanelSpec(
+        (),
+        "error [arcsec]",
+        "field angle [deg]",
+        scales=("log", "log"),
+        xticks=FIELD_TICKS_DEG,
+        names=False,
     )
-    with chart(directory / "weak_perspective", finding, panels=2, note=note) as (above, below):
-        above.plot(angle_deg, np.abs(off_px), color=INK)
-        below.plot(angle_deg, np.abs(off_arcsec), color=INK)
-        above.set(xscale="log", yscale="log", ylabel="error [monitor px]")
-        below.set(yscale="log", ylabel="error [arcsec]", xlabel="field angle [deg]")
-        plain_ticks(below.xaxis, (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60))
+    panels = (
+        CurvePanel(angle_deg, {HIDDEN: np.abs(off_px)}, above, (INK,)),
+        CurvePanel(angle_deg, {HIDDEN: np.abs(off_arcsec)}, below, (INK,)),
+    )
+    draw_curves(directory / "weak_perspective", finding, panels, WEAK_NOTE)
 
 
 def ripples(directory: Path) -> None:
@@ -147,30 +167,21 @@ def ripples(directory: Path) -> None:
     }
     off_mag = {name: magnitude(light) for name, light in curves.items()}
     step_px = np.linspace(0, image.PATH_PX[0], image.STEPS)
-    columns = "x_px", *(f"{name} [mag]" for name in off_mag)
-    write_csv(
-        directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist()
-    )
+    in_mag = {f"{name} [mag]": mag for name, mag in off_mag.items()}
+    write_columns(directory / "popping.csv", {"x_px": step_px, **in_mag})
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
     finding = (
         f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with"
         f" exact codes and by {spread['codes, round']:.3f} mag with rounded ones"
     )
-    note = (
-        f"A star {image.CODES_MAG_UNDER_WHITE:g} mag under white, {image.CODES_BITS} bits, sigma"
-        f" {image.SIGMA_PX:g} px,"
+    linear_only = {"linear image": 1e6 * off_mag["linear image"]}
+    above = PanelSpec((), "light lost [mag]")
+    below = PanelSpec((), "light lost [millionths of a mag]", "displacement in x [px]")
+    panels = (
+        CurvePanel(step_px, off_mag, above, (GREEN, ORANGE, BLUE, INK), THIN),
+        CurvePanel(step_px, linear_only, below, (INK,), THIN),
     )
-    note += (
-        f" {image.STEPS} steps; it moves in y by {image.PATH_PX[1] / image.PATH_PX[0]:.2f} of its"
-        " way in x."
-    )
-    with chart(directory / "popping", finding, panels=2, note=note) as (above, below):
-        for (name, mag), colour in zip(off_mag.items(), (GREEN, ORANGE, BLUE, INK), strict=True):
-            above.plot(step_px, mag, color=colour, label=name, lw=1.0)
-        below.plot(step_px, 1e6 * off_mag["linear image"], color=INK, lw=1.0, label="linear image")
-        above.set(ylabel="light lost [mag]")
-        below.set(ylabel="light lost [millionths of a mag]", xlabel="displacement in x [px]")
-        label_ends(above, below)
+    draw_curves(directory / "popping", finding, panels, POPPING_NOTE)
 
 
 def turns(directory: Path) -> None:
@@ -184,14 +195,15 @@ def turns(directory: Path) -> None:
         "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady"
         f" turn is followed within {two_digits(largest)} arcsec"
     )
-    with chart(directory / "turns", finding) as (axis,):
-        for (name, error), colour in zip(curves.items(), (PURPLE, ORANGE, BLUE), strict=True):
-            axis.plot(turn_deg, np.maximum(error, 1e-12), color=colour, label=name)
-        axis.set(
-            yscale="log",
-            xlabel="turn between samples [deg]",
-            ylabel="largest error between samples [arcsec]",
-        )
-        plain_ticks(axis.xaxis, (0, 60, 120, 180, 240, 300, 360))
-        axis.axvline(180, color=MUTED, ls="--", lw=1.0)
-        label_ends(axis)
+    drawn = {name: np.maximum(error, SMALLEST_ARCSEC) for name, error in curves.items()}
+    spec = PanelSpec(
+        (),
+        "largest error between samples [arcsec]",
+        "turn between samples [deg]",
+        scales=("linear", "log"),
+        xticks=TURN_TICKS_DEG,
+    )
+    panel = CurvePanel(turn_deg, drawn, spec, (PURPLE, ORANGE, BLUE))
+    with chart(directory / "turns", finding) as (axes,):
+        draw_curve_panel(axes, panel)
+        axes.axvline(HALF_TURN_DEG, color=MUTED, ls="--", lw=1.0)

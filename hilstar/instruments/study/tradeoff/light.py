@@ -32,7 +32,6 @@ from hilstar.instruments.study.codes import (
 )
 from hilstar.instruments.study.predictors import ORION
 from hilstar.instruments.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
-from hilstar.instruments.study.sweep import Figure, Trial, Trials
 from hilstar.instruments.study.tradeoff.places import (
     NO_LIMIT_V_MAG,
     SPRITE_PSF,
@@ -40,6 +39,7 @@ from hilstar.instruments.study.tradeoff.places import (
     stars_to,
     turn_to_image,
 )
+from hilstar.instruments.study.trials import Figure, Trial, Trials
 from hilstar.optics.psf import MAX_CUT
 from hilstar.optics.sprites import FrameLight, make_sprites, pack_sprites
 from hilstar.server.bench.build import bench_calibration, brightest_peak_e_per_s

@@ -34,7 +34,7 @@ from hilstar.instruments.study.predictors import (
     slew_attitude,
     slew_sample,
 )
-from hilstar.instruments.study.sweep import Figure, Trial, Trials
+from hilstar.instruments.study.trials import Figure, Trial, Trials
 from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.optics.psf import GaussianPsf

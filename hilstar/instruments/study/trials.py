@@ -1,0 +1,257 @@
+"""Trials: the methods of one step, each with its error and its time; their front, table and chart.
+
+A study of trials makes `Trials` of a step, has them `measured`, and draws and writes them here.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hilstar.basics.charts import (
+    BLUE,
+    MUTED,
+    RED,
+    SideNames,
+    capital,
+    chart,
+    name_at_side,
+    title_lines,
+    two_digits,
+)
+from hilstar.instruments.study.sweep import (
+    MAX_ROUNDS,
+    NOT_JUDGED,
+    Load,
+    OtherWork,
+    Spent,
+    beaten_by,
+    in_turn,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LABEL_COLUMNS = 40  # characters along an axis as high as a panel
+# In a table: on the front, and the default.
+MARKS = {True: "*>", False: "  "}
+SHARE = "1"  # the unit of what has none
+TITLES = {"psf": "PSF"}  # of a step whose name is an abbreviation
+MIN_HEIGHT_INCH, HEAD_INCH, NAME_INCH = 4.2, 1.9, 0.17
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A measure of methods: its name and unit; figures under `floor` count as 0."""
+
+    name: str
+    unit: str
+    floor: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A method: its error and a second figure, in the units of its `Trials`, and the work that is
+    timed.
+
+    `more` are further figures by the names of their columns. The others are measured against the
+    exact one. `measured` adds the median time and its quartiles, ms; `on_front` where no other is
+    both as accurate and as fast; and in `beaten` the method that beats the default, and why the
+    default stays.
+    """
+
+    method: str
+    error: float
+    second: float
+    work: Callable[[], object]
+    is_default: bool = False
+    is_exact: bool = False
+    more: dict[str, float] = field(default_factory=dict)
+    time_ms: float = np.nan
+    quartiles_ms: tuple[float, float] = (np.nan, np.nan)
+    on_front: bool = False
+    beaten: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """All methods of a step. `work` names the timed work, `why_default` is the reason for the
+    default where another beats it.
+
+    `remark` is a caution that the figures alone would hide. `load` is what others took while it was
+    timed.
+    """
+
+    name: str
+    work: str
+    error: Figure
+    second: Figure
+    why_default: str
+    trials: Sequence[Trial]
+    remark: str = ""
+    load: Load = field(default_factory=Load)
+
+    @property
+    def default(self) -> Trial:
+        """The method that hilstar takes."""
+        return next(trial for trial in self.trials if trial.is_default)
+
+
+def measured(step: Trials, budget_s: float) -> Trials:
+    """Time the methods of a step in turn, mark the front, and put the fastest first.
+
+    On a busy machine no method is on the front, and none is said to beat the default.
+    """
+    others = OtherWork()
+    works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
+    times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
+    load = others.load()
+    quartiles = [quartiles_ms(taken) for taken in times.values()]
+    middle_ms = [middle for _, middle, _ in quartiles]
+    errors = [max(trial.error, step.error.floor) for trial in step.trials]
+    # On a busy machine every method counts as beaten: none is on the front.
+    beaten = beaten_by(errors, middle_ms) | load.busy
+    timed = []
+    for trial, (low, middle, high), beats in zip(step.trials, quartiles, beaten, strict=True):
+        on_front = not beats.any()
+        timed.append(replace(trial, time_ms=middle, quartiles_ms=(low, high), on_front=on_front))
+    default = next(k for k, trial in enumerate(timed) if trial.is_default)
+    if not timed[default].on_front and not load.busy:
+        better = [trial for trial, beats in zip(timed, beaten[default], strict=True) if beats]
+        best = min(better, key=lambda trial: trial.time_ms)
+        why = f"{beaten_words(timed[default], best)}; {step.why_default}"
+        timed[default] = replace(timed[default], beaten=why)
+    return replace(step, trials=sorted(timed, key=lambda trial: trial.time_ms), load=load)
+
+
+def quartiles_ms(times: Sequence[Spent]) -> tuple[float, float, float]:
+    """The quartiles of wall times, ms, the median in the middle."""
+    low, middle, high = np.percentile([taken.wall_ms for taken in times], (25, 50, 75)).tolist()
+    return low, middle, high
+
+
+def beaten_words(default: Trial, best: Trial) -> str:
+    """By how much a method beats the default."""
+    saved = 100 * (1 - best.time_ms / default.time_ms)
+    words = f"'{best.method}' is no worse and takes {saved:.0f} % less time"
+    if best.quartiles_ms[1] >= default.quartiles_ms[0]:
+        return f"{words}, and the quartiles of both overlap"
+    return words
+
+
+def table_lines(step: Trials) -> list[str]:
+    """A step's table for a person, the fastest method first."""
+    wide = max(len(row.method) for row in step.trials)
+    columns = (
+        f"{step.error.name} [{step.error.unit}]",
+        f"{step.second.name} [{step.second.unit}]",
+        "ms",
+    )
+    lines = ["", f"{step.name}: {step.work}", f"   {'method':{wide}}  {'   '.join(columns)}"]
+    for row in step.trials:
+        error = f"{row.error:>{len(columns[0])}.3g} "
+        second = f"{row.second:>{len(columns[1])}.3g} "
+        marks = MARKS[row.on_front][0] + MARKS[row.is_default][1]
+        lines.append(f"{marks} {row.method:{wide}}  {error}  {second} {row.time_ms:.3g}")
+    beaten = step.default.beaten
+    if step.load.busy:
+        lines.append(f"   {NOT_JUDGED}")
+    if beaten:
+        lines.append(f"   the default: {beaten}")
+    if step.remark:
+        lines.append(f"   {step.remark}")
+    return lines
+
+
+def finding(step: Trials) -> str:
+    """The title of a step's chart; its times only where they can be judged."""
+    default, exact = step.default, next((trial for trial in step.trials if trial.is_exact), None)
+    off = f"is off by {said(default.error, step.error)}"
+    if default.error <= step.error.floor:
+        off = "has no error"
+    text = f"{TITLES.get(step.name, step.name)}: '{default.method}' {off}"
+    timed = f"{text} in {default.time_ms:.3g} ms"
+    if exact is not None:
+        timed += f"; '{exact.method}' takes {exact.time_ms:.3g} ms"
+    return step.load.title(timed, text)
+
+
+def said(value: float, figure: Figure) -> str:
+    """A figure with its unit; a share has none."""
+    if figure.unit == SHARE:
+        return two_digits(value)
+    return f"{two_digits(value)} {figure.unit}"
+
+
+def draw_trials(path: Path, step: Trials, machine: str) -> None:
+    """Draw error against time on logarithmic axes: the front as a line, the default ringed,
+    every method named at the side.
+    """
+    height = max(MIN_HEIGHT_INCH, HEAD_INCH + NAME_INCH * len(step.trials))
+    note = step.load.note(trials_note(step, machine))
+    with chart(path, finding(step), note=note, height_inch=height) as (axes,):
+        front = [place_of(trial, step) for trial in step.trials if trial.on_front]
+        if len(front) > 1:
+            axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)
+        for trial in step.trials:
+            # A default that is alone on the front has the colour of its name.
+            colour = front_colour(trial)
+            if trial.is_default and len(front) == 1:
+                colour = RED
+            draw_trial(axes, trial, step, colour)
+        ring: dict[str, Any] = {"color": RED, "ms": 14, "mfc": "none", "mew": 2.0, "zorder": 4}
+        axes.plot(*place_of(step.default, step), "o", **ring)
+        unit = step.error.unit.replace(SHARE, "share")
+        ylabel = title_lines(f"{step.error.name} [{unit}]", LABEL_COLUMNS)
+        axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel=ylabel)
+        axes.margins(0.06, 0.08)
+        if any(trial.error < step.error.floor for trial in step.trials):
+            axes.axhline(step.error.floor, color=MUTED, ls=":", lw=1.2)
+        name_at_side(axes, side_names(step))
+
+
+def trials_note(step: Trials, machine: str) -> str:
+    """What is drawn, and on which machine."""
+    front = " Blue: the front, which nothing else is as right and as fast as."
+    if step.load.busy:
+        front = ""
+    dotted = ""
+    if step.error.floor:
+        dotted = f" Dotted: {said(step.error.floor, step.error)}, no error below it."
+    return (
+        f"{capital(step.work)}.{front} Ring: hilstar's default. Bars: quartiles.{dotted} {machine}."
+    )
+
+
+def place_of(trial: Trial, step: Trials) -> tuple[float, float]:
+    """Where a method is drawn: its time, ms, and its error, at least the floor."""
+    return trial.time_ms, max(trial.error, step.error.floor)
+
+
+def front_colour(trial: Trial) -> str:
+    """The colour of a method's point."""
+    if trial.on_front:
+        return BLUE
+    return MUTED
+
+
+def draw_trial(axes: "Axes", trial: Trial, step: Trials, colour: str) -> None:
+    """A method's point, and the quartiles of its times."""
+    place = place_of(trial, step)
+    bar: dict[str, Any] = {"lw": 3.5, "alpha": 0.4, "solid_capstyle": "butt"}
+    axes.plot(trial.quartiles_ms, [place[1]] * 2, color=colour, **bar)
+    axes.plot(*place, "o", color=colour, ms=6, zorder=3)
+
+
+def side_names(step: Trials) -> SideNames:
+    """The names beside the points, the largest error first."""
+    falling = sorted(step.trials, key=lambda trial: (-place_of(trial, step)[1], trial.time_ms))
+    names = []
+    for trial in falling:
+        colour = front_colour(trial)
+        if trial.is_default:
+            colour = RED
+        names.append((trial.method, place_of(trial, step), colour))
+    return names

@@ -1,0 +1,242 @@
+"""Gaussians over a field, fitted to the images of points or small squares.
+
+A point's light is an elliptical Gaussian, integrated over pixels; of a square it is also integrated
+over the square's side. A covariance is xx, yy, xy, px^2, and over the field a polynomial of the
+place. Each image is fitted by Gauss-Newton steps: its light, its background, its place and its
+covariance, whose derivatives are in closed form.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+
+NODES = 9  # of a quadrature over a pixel and a square, along each axis
+# A Gaussian is smooth over a cell, a pixel with its square: from a sigma on, in cells, so many
+# nodes are right to 1e-7 of a peak.
+NODES_FROM = ((2.0, 3), (0.7, 5), (0.0, NODES))
+SIDE_STEPS = 600  # of the weight of a pixel convolved with a square's side
+MIN_VARIANCE_PX2 = 0.15**2
+MAX_CORRELATION = 0.95
+FIT_ROUNDS = 8
+MAX_STEP_PX, MAX_STEP_SHARE = 0.3, 0.6  # of a place, and of a variance, in one round
+RIDGE = 1e-9  # on unit columns: two that are alike share the light
+FIELD_ROUNDS, OUTLIER_MEDIANS = 5, 2.0
+SMALLEST = 1e-300
+XX, YY, XY = 0, 1, 2
+
+
+@lru_cache(maxsize=1024)
+def cell_quadrature(side_px: float, count: int = NODES) -> tuple[FloatArray, FloatArray]:
+    """Gauss's nodes, px, and weights (count,) over a pixel convolved with a square's side.
+
+    The method is Golub and Welsch's (1969).
+    """
+    if side_px == 0:
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        return nodes / 2, weights / 2
+    width_px = 1 + side_px
+    at = (np.arange(SIDE_STEPS) + 0.5) / SIDE_STEPS * width_px - width_px / 2
+    weight = np.clip(width_px / 2 - np.abs(at), 0, min(1.0, side_px))
+    weight /= weight.sum()
+    before, now, norm = np.zeros_like(at), np.ones_like(at), 1.0
+    ratio = 0.0
+    ratios: list[float] = []
+    for _ in range(count - 1):
+        before, now = now, at * now - ratio * before
+        ratio = float(weight @ now**2) / norm
+        norm *= ratio
+        ratios.append(ratio)
+    root = np.sqrt(ratios)
+    nodes, vectors = np.linalg.eigh(np.diag(root, 1) + np.diag(root, -1))
+    return nodes, vectors[0] ** 2
+
+
+def node_count(sigma_cells: float) -> int:
+    """How many nodes a Gaussian of this sigma needs along each axis of a cell."""
+    return next(count for least, count in NODES_FROM if sigma_cells >= least)
+
+
+class PixelGaussians:
+    """Gaussians of covariance (n, 3) in pixels at offsets (n, w) and (n, h) from their middles.
+
+    `side_px` (n,) is the side of the square whose light they are, 0 for a point.
+    """
+
+    def __init__(
+        self,
+        x_px: FloatArray,
+        y_px: FloatArray,
+        covariance: FloatArray,
+        side_px: FloatArray,
+        nodes: int = NODES,
+    ) -> None:
+        xx, yy, xy = bounded(covariance).T
+        self._xx, self._yy, self._xy = (part[:, None, None] for part in (xx, yy, xy))
+        determinant = xx * yy - xy**2
+        self._determinant = determinant[:, None, None]
+        rules = [cell_quadrature(float(side), nodes) for side in np.round(side_px, 3)]
+        at = np.stack([rule[0] for rule in rules])
+        self._weight = np.stack([rule[1] for rule in rules])
+        self._nodes = nodes
+        self._x = x_px[:, :, None] + at[:, None]
+        self._y = y_px[:, :, None] + at[:, None]
+        self._size = len(at), y_px.shape[1], x_px.shape[1]
+        x, y = self._x.reshape(len(at), -1), self._y.reshape(len(at), -1)
+        scale = -0.5 / determinant
+        light = (-2 * scale * xy)[:, None, None] * y[:, :, None] * x[:, None]
+        light += (scale * xx)[:, None, None] * (y * y)[:, :, None]
+        light += (scale * yy)[:, None, None] * (x * x)[:, None]
+        np.exp(light, out=light)
+        self._light = light.reshape(*y.shape, self._size[2], nodes)
+        self._peak = (2 * np.pi * np.sqrt(determinant))[:, None, None]
+
+    @property
+    def shares(self) -> FloatArray:
+        """Shares of light (n, h, w)."""
+        return self._moment(self._over_x(0), 0)
+
+    def slopes(self, shape: bool = False) -> list[FloatArray]:
+        """Shares (n, h, w), and their derivatives by the middle's x and y; with `shape` also by xx,
+        yy and xy.
+        """
+        by_x0, by_x1 = self._over_x(0), self._over_x(1)
+        share, x, y = self._moment(by_x0, 0), self._moment(by_x1, 0), self._moment(by_x0, 1)
+        xx, yy, xy, determinant = self._xx, self._yy, self._xy, self._determinant
+        first = [share, (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant]
+        if not shape:
+            return first
+        x2, x1y1 = self._moment(self._over_x(2), 0), self._moment(by_x1, 1)
+        y2 = self._moment(by_x0, 2)
+        square = determinant**2
+        u2 = (yy * yy * x2 - 2 * yy * xy * x1y1 + xy * xy * y2) / square
+        v2 = (xx * xx * y2 - 2 * xx * xy * x1y1 + xy * xy * x2) / square
+        uv = (-yy * xy * x2 + (xx * yy + xy * xy) * x1y1 - xx * xy * y2) / square
+        by_xx = (u2 - share * yy / determinant) / 2
+        by_yy = (v2 - share * xx / determinant) / 2
+        by_xy = uv + share * xy / determinant
+        return [*first, by_xx, by_yy, by_xy]
+
+    def _over_x(self, power: int) -> FloatArray:
+        """The light times x to a power, mean over each pixel's width: (n, h nodes, w)."""
+        if power == 0:
+            return np.asarray((self._light @ self._weight[:, None, :, None])[..., 0])
+        weight = self._weight[:, None] * self._x**power
+        return np.asarray(np.einsum("nrwk,nwk->nrw", self._light, weight))
+
+    def _moment(self, over_x: FloatArray, power: int) -> FloatArray:
+        """The same times y to a power, mean over each pixel's height: (n, h, w)."""
+        count, height, width = self._size
+        rows = over_x.reshape(count, height, self._nodes, width)
+        weight = self._weight[:, None] * self._y**power
+        return np.asarray((weight[:, :, None] @ rows)[:, :, 0] / self._peak)
+
+
+def bounded(covariance: FloatArray) -> FloatArray:
+    """Covariances (n, 3) that are some: variances not under the smallest, and no line."""
+    xx, yy = np.maximum(covariance[:, :XY], MIN_VARIANCE_PX2).T
+    most = MAX_CORRELATION * np.sqrt(xx * yy)
+    return np.stack([xx, yy, np.clip(covariance[:, XY], -most, most)], axis=1)
+
+
+def normal_equations(
+    columns: FloatArray, weight: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The normal matrices (n, c, c) and right sides (n, c) of columns (n, c, p) against values
+    (n, p), whose weights (n, p) are one over their variance.
+    """
+    weighted = columns * weight[:, None]
+    normal = weighted @ columns.transpose(0, 2, 1)
+    return normal, np.asarray((weighted @ values[:, :, None])[:, :, 0])
+
+
+def amplitudes(columns: Sequence[FloatArray], weight: FloatArray, images: FloatArray) -> FloatArray:
+    """How much (n, c) of each column (n, h, w) images (n, h, w) have, by weighted least squares."""
+    count = len(images)
+    flat = np.stack(columns, axis=1).reshape(count, len(columns), -1)
+    normal, right = normal_equations(flat, weight.reshape(count, -1), images.reshape(count, -1))
+    size = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), SMALLEST))
+    unit = normal / size[:, :, None] / size[:, None, :] + RIDGE * np.eye(len(columns))
+    solved = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0]
+    return np.asarray(solved / size)
+
+
+@dataclass(frozen=True, slots=True)
+class PointImages:
+    """Images (n, s, s) of points or squares, one over the variance of their pixels, their middle
+    pixels and the sides (n,) of the squares, px.
+
+    `has_level` says that each stands on a background of its own.
+    """
+
+    images: FloatArray
+    weight: FloatArray
+    column: FloatArray | IntArray
+    row: FloatArray | IntArray
+    side_px: FloatArray
+    has_level: bool = True
+
+    def offsets(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels' places less the points' (n,), along x and y (n, s)."""
+        reach = np.arange(self.images.shape[1]) - self.images.shape[1] // 2
+        return (self.column - x_px)[:, None] + reach, (self.row - y_px)[:, None] + reach
+
+
+@dataclass(frozen=True, slots=True)
+class PointGaussians:
+    """Places (n,), px, and covariances (n, 3), px^2, of points."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    covariance: FloatArray
+
+
+def fit_each(
+    points: PointImages, start: PointGaussians, rounds: int = FIT_ROUNDS, alike: bool = False
+) -> PointGaussians:
+    """The Gaussian of each image; where all are `alike`, one covariance for all: its steps are the
+    medians of theirs.
+    """
+    x_px, y_px, covariance = start.x_px, start.y_px, start.covariance
+    cell_px = 1 + float(points.side_px.max(initial=0.0))
+    for _ in range(rounds):
+        sigma_px = float(np.sqrt(bounded(covariance)[:, :XY].min()))
+        count = node_count(sigma_px / cell_px)
+        offsets = points.offsets(x_px, y_px)
+        gaussians = PixelGaussians(*offsets, covariance, points.side_px, count)
+        slopes = gaussians.slopes(shape=True)
+        if points.has_level:
+            slopes.append(np.ones_like(slopes[0]))
+        solved = amplitudes(slopes, points.weight, points.images)
+        steps = solved[:, 1:6] / np.maximum(np.abs(solved[:, :1]), SMALLEST)
+        moves = np.clip(steps[:, :2], -MAX_STEP_PX, MAX_STEP_PX)
+        growth = steps[:, 2:]
+        if alike:
+            growth = np.median(growth, axis=0, keepdims=True)
+        variance = bounded(covariance)
+        most = MAX_STEP_SHARE * np.sqrt(variance[:, XX] * variance[:, YY])[:, None]
+        covariance = bounded(covariance + np.clip(growth, -most, most))
+        x_px, y_px = x_px + moves[:, 0], y_px + moves[:, 1]
+    return PointGaussians(x_px, y_px, covariance)
+
+
+def place_terms(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Terms (n, 6) of scaled places (n,): 1, u, v, u^2, u v, v^2."""
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+
+
+def over_field(terms: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Coefficients (T, 3) of covariances (n, 3) by terms (n, T) of their places.
+
+    It is robust: a point with a neighbour or a hot pixel has another covariance.
+    """
+    weight = np.ones((len(terms), 1))
+    for _ in range(FIELD_ROUNDS):
+        solved = np.linalg.lstsq(terms * weight, covariance * weight, rcond=None)[0]
+        off = np.abs(covariance - terms @ solved).max(axis=1, keepdims=True)
+        usual = max(OUTLIER_MEDIANS * float(np.median(off)), RIDGE)
+        weight = 1 / np.maximum(1.0, off / usual)
+    return np.asarray(solved, dtype=np.float64)

@@ -347,7 +347,7 @@ class LiveTracker(Closing):
         seen = find_stars(image, settings, background)
         good = ~seen.at_edge
         x_px, y_px = seen.x_px[good], seen.y_px[good]
-        flux_e = seen.flux[good] * self.config.tracker.detector.gain_e_per_dn
+        flux_e = seen.flux[good] * self._detector.settings.gain_e_per_dn
         return FoundStars(x_px, y_px, flux_e, normalise(self.camera.rays(x_px, y_px)))
 
     def reported_stars(self, solved: Solved) -> tuple[ReportedStar, ...]:
@@ -355,7 +355,7 @@ class LiveTracker(Closing):
         found, pairs, gain = (
             solved.found,
             solved.identified,
-            self.config.tracker.detector.gain_e_per_dn,
+            self._detector.settings.gain_e_per_dn,
         )
         hip = (
             {}

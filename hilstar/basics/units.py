@@ -110,6 +110,9 @@ ASCII_OF = {
     "\u2009": " ",
     "\u202f": " ",
 }
+# OpenGL versions to ask for, newest first: NVIDIA's driver gives the version that is asked for, and
+# no newer one.
+GL_VERSIONS = ((4, 6), (4, 5), (4, 3), (3, 3))
 
 
 @overload
@@ -133,11 +136,6 @@ def magnitude(ratio: "float | FloatArray") -> "float | FloatArray":
         with np.errstate(divide="ignore"):
             return np.asarray(-2.5 * np.log10(ratio))
     return -2.5 * math.log10(ratio) if ratio > 0 else math.inf
-
-
-# OpenGL versions to ask for, newest first: NVIDIA's driver gives the version that is asked for, and
-# no newer one.
-GL_VERSIONS = ((4, 6), (4, 5), (4, 3), (3, 3))
 
 
 @cache

@@ -26,6 +26,7 @@ NORM_TOLERANCE = 1e-3
 ADVICE = "give a file that `hilstar calibrate geometric` or `alignment` wrote"
 Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
+KIND = "hilstar geometry 1"
 
 
 class FieldTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -132,9 +133,6 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     error: ErrorTable | None = None
     made: MadeTable | None = None
     monitor_identity: MonitorIdentity | None = None
-
-
-KIND = "hilstar geometry 1"
 
 
 def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:

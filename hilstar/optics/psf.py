@@ -87,6 +87,8 @@ FINE_SIGMAS, MIN_PARTS, MAX_PARTS, SHARPEST_PX = 0.7, 3, 16, 0.2
 ONE_PSF = "one PSF for all stars"  # by this name it may be chosen
 # A PSF that is the same for all light gives all of it to one wavelength, whichever.
 ALL_LIGHT, ONE_WAVELENGTH_NM = np.ones(1), np.array([550.0])
+MAX_FILE_BYTES = 20_000_000
+FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in its middle"
 
 
 class ShareShader(NamedTuple):
@@ -636,10 +638,6 @@ class SampledPsf(Psf):
         wide = np.pad(self.samples, math.ceil(6 * sigma))
         spread = np.fft.ifft2(fourier_gaussian(np.fft.fft2(wide), sigma)).real
         return SampledPsf(spread, self.per_px, self.pixel_integrated)
-
-
-MAX_FILE_BYTES = 20_000_000
-FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in its middle"
 
 
 def read_psf(path: Path) -> SampledPsf:

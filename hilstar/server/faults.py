@@ -41,6 +41,8 @@ MAX_MESSAGE_BYTES = 16_384
 # after.
 MAX_BURST, MAX_PER_S = 50, 10
 FORM = 'write a JSON object with kind and name, {"start": "NAME"} or {"stop": "NAME"}'
+WORDS = {"start": "begins", "end": "ends", "missed": "fell between two frames"}
+MAX_NAMES = 100  # in the summary: a stream may make up names
 
 
 def act(schedule: FaultSchedule, raw: bytes) -> None:
@@ -170,10 +172,6 @@ def read_recording(path: Path, records: Sequence[FaultRecord] | None = None) -> 
                 f"{path}: {folder / fault.file} is not the map that the run had; put that one there"
             )
     return Recording(faults, seed, folder, records)
-
-
-WORDS = {"start": "begins", "end": "ends", "missed": "fell between two frames"}
-MAX_NAMES = 100  # in the summary: a stream may make up names
 
 
 class RunFaults:

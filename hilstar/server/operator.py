@@ -20,6 +20,8 @@ from hilstar.server.bench.frame import Bench
 PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of white
 _BITS = {"blank": BLANK, "grid": GRID, "crosshair": CROSSHAIR}
 SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")
+GAMMA = "gamma"  # the kind of event while another program's gamma ramp lies on the display
+SKY_AGAIN = "the sky of the attitude again"
 
 
 class Aids:
@@ -117,8 +119,6 @@ class OnScreen:
 
 
 HEADLESS = OnScreen()
-GAMMA = "gamma"  # the kind of event while another program's gamma ramp lies on the display
-SKY_AGAIN = "the sky of the attitude again"
 
 
 class Operator:

@@ -16,6 +16,8 @@ from hilstar.display.render.backend import Backend
 from hilstar.server.answers.judge import TrackerFigures
 from hilstar.server.sync import BeatSummary, SyncSummary
 
+MAX_LATE_SHARE = 0.01  # of frames that may be missed or stale where --strict passes
+
 
 class PacketSummary(msgspec.Struct, frozen=True):
     """Packets of a run, those refused by reason, and how many were lost: gaps of their `sequence`.
@@ -29,9 +31,6 @@ class PacketSummary(msgspec.Struct, frozen=True):
     refused_by: dict[Reason, int]
     lost: int = 0
     shown: dict[Reason, str] | UnsetType = UNSET
-
-
-MAX_LATE_SHARE = 0.01  # of frames that may be missed or stale where --strict passes
 
 
 class RunVerdict(msgspec.Struct, frozen=True):

@@ -12,6 +12,17 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.render.backend import Backend
 
 NONE_YET_NS = 2 * NS_PER_S
+LOOK_S = 0.25
+STUCK_NS = NS_PER_S
+# A frame is reported as late after this many refresh periods and this many ms; shorter delays
+# happen on any busy machine.
+LATE_PERIODS = 3.0
+LATE_NS = 50 * NS_PER_MS
+TOLD_EVERY_NS = NS_PER_S
+GPU_LOST = "gpu-lost"
+GPU_LOOK_NS = NS_PER_S
+# two clocks read one after the other, with the process interrupted between them, differ by less
+SLEPT_NS = 200 * NS_PER_MS
 
 
 class AttitudeWatch:
@@ -50,15 +61,6 @@ class AttitudeWatch:
         elif not stale and self._stale_ns is not None:
             stale_s, self._stale_ns = (now_ns - self._stale_ns) / NS_PER_S, None
             self._notices.tell("fresh", f"the attitude is fresh again, after {stale_s:.1f} s")
-
-
-LOOK_S = 0.25
-STUCK_NS = NS_PER_S
-# A frame is reported as late after this many refresh periods and this many ms; shorter delays
-# happen on any busy machine.
-LATE_PERIODS = 3.0
-LATE_NS = 50 * NS_PER_MS
-TOLD_EVERY_NS = NS_PER_S
 
 
 class FrameWatch:
@@ -129,12 +131,6 @@ class FrameWatch:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
-
-
-GPU_LOST = "gpu-lost"
-GPU_LOOK_NS = NS_PER_S
-# two clocks read one after the other, with the process interrupted between them, differ by less
-SLEPT_NS = 200 * NS_PER_MS
 
 
 class GpuWatch:

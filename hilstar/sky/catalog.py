@@ -53,6 +53,23 @@ MAX_DIGITS = 19  # a 64-bit identifier
 
 Letters = npt.NDArray[np.bytes_]
 STAR_NAMES = Path(__file__).resolve().parent / "data" / "star_names.csv"
+MISSING = np.iinfo(np.int64).min
+# The range of each field; beyond it no rate or place means anything.
+RANGES: dict[str, tuple[float, float]] = {
+    "hip": (0, 2**31 - 1),
+    "v_mag": (-30, 40),
+    "ra_deg": (0, 360),
+    "dec_deg": (-90, 90),
+    "parallax_mas": (-1000, 1000),  # Proxima: 772
+    "pm_ra_cosdec_mas_yr": (-20_000, 20_000),  # Barnard's star: 10 400
+    "pm_dec_mas_yr": (-20_000, 20_000),
+    "bv_mag": (-10, 20),
+    "vi_mag": (-10, 20),
+    "hp_brightest_mag": (-30, 40),
+    "hp_faintest_mag": (-30, 40),
+    "period_d": (0, 100_000),
+    "separation_arcsec": (0, 1000),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -236,25 +253,6 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
         )
     table = np.array(rows, dtype=np.int64)
     return {name: table[:, i] for i, name in enumerate((*FIELDS, *LETTERS))}, rows_read
-
-
-MISSING = np.iinfo(np.int64).min
-# The range of each field; beyond it no rate or place means anything.
-RANGES: dict[str, tuple[float, float]] = {
-    "hip": (0, 2**31 - 1),
-    "v_mag": (-30, 40),
-    "ra_deg": (0, 360),
-    "dec_deg": (-90, 90),
-    "parallax_mas": (-1000, 1000),  # Proxima: 772
-    "pm_ra_cosdec_mas_yr": (-20_000, 20_000),  # Barnard's star: 10 400
-    "pm_dec_mas_yr": (-20_000, 20_000),
-    "bv_mag": (-10, 20),
-    "vi_mag": (-10, 20),
-    "hp_brightest_mag": (-30, 40),
-    "hp_faintest_mag": (-30, 40),
-    "period_d": (0, 100_000),
-    "separation_arcsec": (0, 1000),
-}
 
 
 def _parse_row(row: list[str], where: str) -> list[int] | None:

@@ -94,6 +94,15 @@ DTYPES = {"hip": "i4", "identifier": "i8", "variable": "S1", "multiple": "S1"} |
 )
 ALWAYS_KNOWN = ("ra_deg", "dec_deg", "v_mag", "bv_mag", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
 log = logging.getLogger(__name__)
+MAY_BE_UNKNOWN = ("vi_mag", "parallax_mas")
+_STATE_EPOCH = "write [sky] catalogue_epoch_jyear, such as 2000.0"
+_REASONS = (
+    "",
+    "without a place",
+    "without a magnitude and a colour",
+    "beyond what a star has",
+    "repeated",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -380,17 +389,6 @@ class _Columns:
                 f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}"
             )
         return np.full(self.table.row_count, GAIA_DR3_JYEAR), "places without motion"
-
-
-MAY_BE_UNKNOWN = ("vi_mag", "parallax_mas")
-_STATE_EPOCH = "write [sky] catalogue_epoch_jyear, such as 2000.0"
-_REASONS = (
-    "",
-    "without a place",
-    "without a magnitude and a colour",
-    "beyond what a star has",
-    "repeated",
-)
 
 
 def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:

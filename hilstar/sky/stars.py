@@ -37,6 +37,18 @@ MIN_ACROSS, MIN_UP = 1e-6, 0.05  # ERFA's limits of refraction (atioq)
 MOST_BENT_RAD = 0.012  # by those, in 1100 hPa and -50 C; 0.69 degrees
 LOW_RAD, LESS_BENT_RAD = 0.35, 0.0015  # above 20 degrees light is bent by less than 5 arcmin
 RAD_PER_MAS = np.pi / (180 * 3600 * 1000)
+BV_MAG = np.linspace(-0.4, 2.4, 57)  # for light that is no star's
+# Of each star, beside its vector.
+COLUMNS = (
+    "hip",
+    "v_mag",
+    "bv_mag",
+    "temperature_k",
+    "electrons_per_s",
+    "row",
+    "colours",
+    "primaries",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,20 +113,6 @@ def tell(told: set[str], key: str, text: str, *values: object) -> None:
     if key not in told:
         told.add(key)
         log.warning(text, *values)
-
-
-BV_MAG = np.linspace(-0.4, 2.4, 57)  # for light that is no star's
-# Of each star, beside its vector.
-COLUMNS = (
-    "hip",
-    "v_mag",
-    "bv_mag",
-    "temperature_k",
-    "electrons_per_s",
-    "row",
-    "colours",
-    "primaries",
-)
 
 
 @dataclass(frozen=True, slots=True)

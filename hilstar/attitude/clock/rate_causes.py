@@ -49,6 +49,21 @@ NOISE_RATIO = 2.0  # over ten and more turns a chance error is within 1.5 times 
 LAG_TIE = 0.02  # share of the range of errors
 KEY = "[attitude] convention"
 HOW_IT_SENDS = "look at what the simulator puts into its quaternion"
+# What a rate of 1 rad/s is in units that senders confuse with it.
+UNITS = {
+    "deg/s": math.degrees(1.0),
+    "arcsec/s": math.degrees(3600.0),
+    "mrad/s": 1e3,
+    "rad/ms": 1e-3,
+    "rpm": 60 / math.tau,
+    "revolutions/s": 1 / math.tau,
+    "rad/s times pi/180": math.radians(1.0),
+}
+DEGREES = (("", 1.0), (" and in deg/s", UNITS["deg/s"]))
+SAME = np.eye(3)
+OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
+OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
+GROSS = "no unit, sign or order of axes explains them"
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,23 +236,6 @@ class Cause:
         if self.constant is not None:
             mended = mended - self.constant
         return float(np.linalg.norm(turn - mended))
-
-
-# What a rate of 1 rad/s is in units that senders confuse with it.
-UNITS = {
-    "deg/s": math.degrees(1.0),
-    "arcsec/s": math.degrees(3600.0),
-    "mrad/s": 1e3,
-    "rad/ms": 1e-3,
-    "rpm": 60 / math.tau,
-    "revolutions/s": 1 / math.tau,
-    "rad/s times pi/180": math.radians(1.0),
-}
-DEGREES = (("", 1.0), (" and in deg/s", UNITS["deg/s"]))
-SAME = np.eye(3)
-OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
-OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
-GROSS = "no unit, sign or order of axes explains them"
 
 
 def _causes() -> Iterator[Cause]:

@@ -36,6 +36,13 @@ HELD_S = 3.0  # for so long after its last byte a tracker's connection holds the
 ACCEPT_EACH_S = 0.02
 TOLD_S = 10.0  # for so long after the last one a refused connection stands in the status
 Place = tuple[str, int]
+KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
 
 
 class ByteLink(Closing):
@@ -359,15 +366,6 @@ class ZmqBytes(ByteLink):
     def close(self) -> None:
         """Close the socket."""
         self._receiver.close()
-
-
-KINDS = {
-    stat.S_IFDIR: "a directory",
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFSOCK: "a socket",
-}
 
 
 def no_file_kind(mode: int) -> str:

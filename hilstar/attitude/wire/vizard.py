@@ -63,6 +63,15 @@ PLAIN_ANSWERS = {b"PING": [b"PONG"], b"REQUEST_INPUT": [b"VIZARD_INPUT", b""]}
 OK, ERROR = b"OK", b"ERROR"
 HELD = 2
 MAX_HELD_NS = NS_PER_S // 4
+TURNS = (
+    "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body"
+    " components"
+)
+VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
+PLACE = (
+    "its place and velocity about the Earth (at N's origin, where the message has none) are those"
+    " of the observer"
+)
 
 
 def update_of(parts: list[bytes]) -> bytes | None:
@@ -103,15 +112,6 @@ def _written(q: FloatArray) -> str:
     return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in sigma)})"
 
 
-TURNS = (
-    "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body"
-    " components"
-)
-VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
-PLACE = (
-    "its place and velocity about the Earth (at N's origin, where the message has none) are those"
-    " of the observer"
-)
 # what is used of a message, besides the attitude
 StateUse = Literal["attitude", "velocity", "state"]
 TOLD: dict[StateUse, tuple[str, ...]] = {"attitude": (), "velocity": (VELOCITY,), "state": (PLACE,)}

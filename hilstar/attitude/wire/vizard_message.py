@@ -18,6 +18,24 @@ MAX_COMPONENTS = 4  # kept of a vector: one more than it may have
 DOUBLE, INTEGER, MESSAGE, BYTES = 1, 3, 11, 12
 ONE, SEVERAL = 1, 3  # its labels
 Components = tuple[float, ...]
+# Each message's fields, named as here: number, type, label.
+FORMS = {
+    "TimeStamp": {"frame": (1, INTEGER, ONE), "elapsed_ns": (2, DOUBLE, ONE)},
+    "VizBody": {
+        "name": (1, BYTES, ONE),
+        "position_m": (2, DOUBLE, SEVERAL),
+        "velocity_m_s": (3, DOUBLE, SEVERAL),
+        "sigma_bn": (4, DOUBLE, SEVERAL),
+        "parent": (19, BYTES, ONE),
+    },
+    "VizCamera": {
+        "identity": (1, INTEGER, ONE),
+        "field_of_view_deg": (3, DOUBLE, ONE),
+        "resolution_px": (4, INTEGER, SEVERAL),
+        "sigma": (8, DOUBLE, SEVERAL),
+    },
+}
+PARTS = {"time": (1, "TimeStamp", ONE), "bodies": (2, "VizBody", SEVERAL)}
 
 
 class WireFormatError(ValueError):
@@ -60,24 +78,6 @@ class SimUpdate(NamedTuple):
     bodies: tuple[VizBody, ...] = ()
 
 
-# Each message's fields, named as here: number, type, label.
-FORMS = {
-    "TimeStamp": {"frame": (1, INTEGER, ONE), "elapsed_ns": (2, DOUBLE, ONE)},
-    "VizBody": {
-        "name": (1, BYTES, ONE),
-        "position_m": (2, DOUBLE, SEVERAL),
-        "velocity_m_s": (3, DOUBLE, SEVERAL),
-        "sigma_bn": (4, DOUBLE, SEVERAL),
-        "parent": (19, BYTES, ONE),
-    },
-    "VizCamera": {
-        "identity": (1, INTEGER, ONE),
-        "field_of_view_deg": (3, DOUBLE, ONE),
-        "resolution_px": (4, INTEGER, SEVERAL),
-        "sigma": (8, DOUBLE, SEVERAL),
-    },
-}
-PARTS = {"time": (1, "TimeStamp", ONE), "bodies": (2, "VizBody", SEVERAL)}
 PARTS |= {"spacecraft": (3, "VizBody", SEVERAL), "cameras": (4, "VizCamera", SEVERAL)}
 
 

@@ -32,6 +32,29 @@ if TYPE_CHECKING:
 TABLE_WIDTH = 1024  # that of encode.frag
 _shader = cache(lambda name: resource_path("shaders", name).read_text())
 TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
+MAX_RATE = 3e38  # in float32
+# star.vert's
+INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}
+# cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6
+# px)
+SPRITE_PIXEL_COST = 4
+# Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of
+# light (llvmpipe, 1080p and 4K).
+MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
+MAX_ERASED_REGION = 0.25  # as much of rectangles, which sprites' overheads do not slow
+# On a graphics card: an H100 cleared 7680 x 4320 in 4 ms, and erased 10 000 sprites on it in 0.1
+# ms.
+MAX_ERASED_BY_CARD = 1.0
+IMAGES_VERSION = 420  # the OpenGL that has images in shaders
+# A level is missed only where the wings of more stars than this meet outside all of their own
+# squares (see `lit_sides`).
+MEETING_WINGS = 16
+# In frames that are not in units (see `LightUnits`) and whose stars are apart, `round` cuts each
+# star's light at a square. No pixel beyond it has more than 1 / CUT_WINGS of the light that lights
+# one, 1 / 64 of the first step. A lone star has the same levels; of 10 000 on 1080p three in a
+# thousand have a pixel (twelve of 82 000 lit ones in all) that is one level lower, where wings
+# meet, and all have 0.002 mag rms.
+CUT_WINGS = 32
 
 
 def build_program(
@@ -148,31 +171,6 @@ def sprites_array(
     return program.ctx.vertex_array(
         program, [(buffer, " ".join(layout), *(name for name in inputs if name in program))]
     )
-
-
-MAX_RATE = 3e38  # in float32
-# star.vert's
-INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}
-# cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6
-# px)
-SPRITE_PIXEL_COST = 4
-# Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of
-# light (llvmpipe, 1080p and 4K).
-MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
-MAX_ERASED_REGION = 0.25  # as much of rectangles, which sprites' overheads do not slow
-# On a graphics card: an H100 cleared 7680 x 4320 in 4 ms, and erased 10 000 sprites on it in 0.1
-# ms.
-MAX_ERASED_BY_CARD = 1.0
-IMAGES_VERSION = 420  # the OpenGL that has images in shaders
-# A level is missed only where the wings of more stars than this meet outside all of their own
-# squares (see `lit_sides`).
-MEETING_WINGS = 16
-# In frames that are not in units (see `LightUnits`) and whose stars are apart, `round` cuts each
-# star's light at a square. No pixel beyond it has more than 1 / CUT_WINGS of the light that lights
-# one, 1 / 64 of the first step. A lone star has the same levels; of 10 000 on 1080p three in a
-# thousand have a pixel (twelve of 82 000 lit ones in all) that is one level lower, where wings
-# meet, and all have 0.002 mag rms.
-CUT_WINGS = 32
 
 
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:

@@ -23,6 +23,7 @@ CM_ROUNDING_MM = 5.0
 MAX_LISTED = 18
 NVIDIA = "nvidia-settings: "
 WRONG, DOUBTFUL, RIGHT = "wrong", "doubtful", "right"
+DITHERS = "the driver adds a pattern to every code"
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +246,6 @@ def _by_nvidia(attribute: str) -> str:
     return f'nvidia-settings -a "[DPY:{{output}}]/{attribute}"'
 
 
-DITHERS = "the driver adds a pattern to every code"
 RULES = (
     _Rule(
         "Broadcast RGB",

@@ -41,6 +41,36 @@ MAX_ITEMS = 4096  # items of four bytes
 NVIDIA_S = 3.0
 BYTE_BITS = 8
 _Id, _Ids, UINT = NUMBER, ctypes.POINTER(NUMBER), ctypes.c_uint
+XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
+    "XRRGetScreenResourcesCurrent": (POINTER, POINTER, _Id),
+    "XRRGetOutputInfo": (POINTER, POINTER, POINTER, _Id),
+    "XRRGetCrtcInfo": (POINTER, POINTER, POINTER, _Id),
+    "XRRGetCrtcGamma": (POINTER, POINTER, _Id),
+    "XRRGetCrtcTransform": (INT, POINTER, _Id, POINTER),
+    "XRRListOutputProperties": (_Ids, POINTER, _Id, POINTER),
+    "XRRGetOutputProperty": (
+        INT,
+        POINTER,
+        _Id,
+        _Id,
+        *[ctypes.c_long] * 2,
+        *[INT] * 2,
+        _Id,
+        *[POINTER] * 5,
+    ),
+    "XRRGetProviderResources": (POINTER, POINTER, _Id),
+    "XRRGetProviderInfo": (POINTER, POINTER, POINTER, _Id),
+} | {
+    f"XRRFree{what}": (None, POINTER)
+    for what in (
+        "ScreenResources",
+        "OutputInfo",
+        "CrtcInfo",
+        "Gamma",
+        "ProviderResources",
+        "ProviderInfo",
+    )
+}
 
 
 # XRRModeInfo; of `sync` the third are a line's pixels, the last a frame's lines
@@ -130,38 +160,6 @@ class _Provider(ctypes.Structure):  # XRRProviderInfo, its beginning
         ),
         ("name", TEXT),
     )
-
-
-XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
-    "XRRGetScreenResourcesCurrent": (POINTER, POINTER, _Id),
-    "XRRGetOutputInfo": (POINTER, POINTER, POINTER, _Id),
-    "XRRGetCrtcInfo": (POINTER, POINTER, POINTER, _Id),
-    "XRRGetCrtcGamma": (POINTER, POINTER, _Id),
-    "XRRGetCrtcTransform": (INT, POINTER, _Id, POINTER),
-    "XRRListOutputProperties": (_Ids, POINTER, _Id, POINTER),
-    "XRRGetOutputProperty": (
-        INT,
-        POINTER,
-        _Id,
-        _Id,
-        *[ctypes.c_long] * 2,
-        *[INT] * 2,
-        _Id,
-        *[POINTER] * 5,
-    ),
-    "XRRGetProviderResources": (POINTER, POINTER, _Id),
-    "XRRGetProviderInfo": (POINTER, POINTER, POINTER, _Id),
-} | {
-    f"XRRFree{what}": (None, POINTER)
-    for what in (
-        "ScreenResources",
-        "OutputInfo",
-        "CrtcInfo",
-        "Gamma",
-        "ProviderResources",
-        "ProviderInfo",
-    )
-}
 
 
 class Randr(Closing):

@@ -53,6 +53,21 @@ from hilstar.server.record.ledger_records import AnswerRecord, answer_records, c
 MISSED_CYCLES = 1.5  # a longer time between right answers is an outage
 LOST_CYCLES = 3.0  # in a longer outage the lock is lost
 MAX_CYCLES = 20_000_000
+AGREE_RAD = np.radians(1.0)  # half of the answers of one sky lie this near to one rotation
+MAX_TURN_RAD = np.radians(5.0)  # from commanded to reported; a larger rotation is another frame
+NEAR_AXES_RAD = np.radians(5.0)
+MIN_PAIRS = 8
+SEED = 0  # the bootstrap's seed: the same files give the same intervals
+SMALL = 0.3  # share of the noise above which the display's own error gets a note
+BENT_ARCSEC = 0.1
+# noise that lasts for so many answers gets a note from this share of the variance on
+TOGETHER, SLOW_SHARE = 20, 0.1
+CLOCK_SET = (
+    "the tracker's clock was set during the run: its answers are placed by their arrivals, not by"
+    " their stamps"
+)
+# answers whose median shift against their arrivals is compared with the next ones'
+SET_BLOCK, MAX_CLOCK_DRIFT = 11, 2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,23 +163,6 @@ def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: Bool
         outages=tuple(outages),
         acquisitions=tuple(sorted(acquisitions, key=lambda each: each.start_s)),
     )
-
-
-AGREE_RAD = np.radians(1.0)  # half of the answers of one sky lie this near to one rotation
-MAX_TURN_RAD = np.radians(5.0)  # from commanded to reported; a larger rotation is another frame
-NEAR_AXES_RAD = np.radians(5.0)
-MIN_PAIRS = 8
-SEED = 0  # the bootstrap's seed: the same files give the same intervals
-SMALL = 0.3  # share of the noise above which the display's own error gets a note
-BENT_ARCSEC = 0.1
-# noise that lasts for so many answers gets a note from this share of the variance on
-TOGETHER, SLOW_SHARE = 20, 0.1
-CLOCK_SET = (
-    "the tracker's clock was set during the run: its answers are placed by their arrivals, not by"
-    " their stamps"
-)
-# answers whose median shift against their arrivals is compared with the next ones'
-SET_BLOCK, MAX_CLOCK_DRIFT = 11, 2e-3
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,15 @@ MAX_EDGE_BYTES = 20_000_000  # a day of toggles
 MIN_EDGES = 20
 EDGE_FORM = "write lines of host_ns,level"
 DEVICE_FORM = "send a line 0 or 1 at each edge, or 0,MICROSECONDS by the device's own clock"
+MAX_LATENCY_NS = 500 * NS_PER_MS
+# a clock that is read after the swap may give a time later than that of the light
+MAX_EARLY_NS = 5 * NS_PER_MS
+BIN_NS = NS_PER_MS
+# relative to the best peak: with a square that toggles, the latency repeats every two frames
+LIKELY_SHARE = 0.9
+AGREEING_SHARE = 0.5  # share of the edges that must find their frames
+BINS = 80
+LEVEL_NAMES = {1: "dark to light", 0: "light to dark"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +118,6 @@ def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
     """The changes of the square, from the swaps and levels of frames (n,)."""
     changed = np.flatnonzero(np.diff(level)) + 1
     return Edges(swap_ns[changed], level[changed])
-
-
-MAX_LATENCY_NS = 500 * NS_PER_MS
-# a clock that is read after the swap may give a time later than that of the light
-MAX_EARLY_NS = 5 * NS_PER_MS
-BIN_NS = NS_PER_MS
-# relative to the best peak: with a square that toggles, the latency repeats every two frames
-LIKELY_SHARE = 0.9
-AGREEING_SHARE = 0.5  # share of the edges that must find their frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,10 +254,6 @@ def write_panel_delay(path: Path, panel_delay_ms: float, error_ms: float) -> Non
             " in plain form"
         )
     write_whole(path, text)
-
-
-BINS = 80
-LEVEL_NAMES = {1: "dark to light", 0: "light to dark"}
 
 
 def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[str, Any]:

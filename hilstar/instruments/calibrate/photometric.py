@@ -63,6 +63,11 @@ MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
 MIN_LIGHT = 1e-9  # relative to white, at code 1
 # relative to white: in float64 it survives a black level a thousand times as bright
 MIN_STEP = 1e-12
+DECADES = (0, 1, 2, 3)  # below white, where the error of the response is stated
+NOT_STATED = "not stated"
+MIN_DRAWN_LIGHT = 1e-5  # relative to white, as drawn
+COLOURS = {"w": INK, "r": RED, "g": GREEN, "b": BLUE}
+NAMES = {"w": "white", "r": "red", "g": "green", "b": "blue"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,10 +397,6 @@ def _stiffest(problem: _Problem, design: FloatArray, target: FloatArray, before:
     return float(np.clip(found.x, LOG_STIFFNESS[0], LOG_STIFFNESS[-1]))
 
 
-DECADES = (0, 1, 2, 3)  # below white, where the error of the response is stated
-NOT_STATED = "not stated"
-
-
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """Who measured, when (by default today), the instrument, and the unit."""
@@ -575,11 +576,6 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     percent = {f"{name}_percent": 100 * float(value) for name, value in found.items()}
     mag = {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
     return percent | mag | {"p95_sigmas": sigmas}
-
-
-MIN_DRAWN_LIGHT = 1e-5  # relative to white, as drawn
-COLOURS = {"w": INK, "r": RED, "g": GREEN, "b": BLUE}
-NAMES = {"w": "white", "r": "red", "g": "green", "b": "blue"}
 
 
 def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str:

@@ -31,6 +31,8 @@ MIN_PLANNED_LIGHT = 10**-3.2
 # relative to white; levels below it are planned twice as often, because the black level drowns them
 FAINT_LIGHT = 1e-2
 PATCHES_PER_REFERENCE = 8  # between two rounds of black, half and white
+KEY_POLL_S = 0.02
+PATCH_SHARE = 1 / 3  # relative to the screen's smaller side
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -132,8 +134,6 @@ def is_filled_in(path: Path) -> bool:
 
 
 Level = TypeVar("Level", bound=np.unsignedinteger)
-KEY_POLL_S = 0.02
-PATCH_SHARE = 1 / 3  # relative to the screen's smaller side
 log = logging.getLogger(__name__)
 
 

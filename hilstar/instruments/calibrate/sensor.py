@@ -43,6 +43,9 @@ GREEK = {"σ": "sigma", "μ": "mu", "µ": "mu", "η": "eta", "τ": "tau"}
 # Of one quantity in DN and in electrons, both rounded.
 ROUNDED_ALIKE = 0.05
 WAVELENGTH = re.compile(r"(?:lambda=)?(\d+(?:\.\d+)?)nm")
+GAIN_UNITS: dict[str, Callable[[float], float]] = {"dn/e-": lambda value: 1 / value}
+ELECTRONS: dict[str, Callable[[float], float]] = {"e-": float, "ke-": lambda value: 1000 * value}
+SHARES: dict[str, Callable[[float], float]] = {"%": lambda value: value / 100, "1": float}
 
 
 class Quantity(NamedTuple):
@@ -58,9 +61,6 @@ class Quantity(NamedTuple):
     by_gain: str = ""
 
 
-GAIN_UNITS: dict[str, Callable[[float], float]] = {"dn/e-": lambda value: 1 / value}
-ELECTRONS: dict[str, Callable[[float], float]] = {"e-": float, "ke-": lambda value: 1000 * value}
-SHARES: dict[str, Callable[[float], float]] = {"%": lambda value: value / 100, "1": float}
 QUANTITIES = (
     Quantity(
         ("k", "overallsystemgain", "systemgain", "conversiongain"), "gain_e_per_dn", GAIN_UNITS

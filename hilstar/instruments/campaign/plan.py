@@ -89,6 +89,7 @@ SCENARIO = "scenario"  # the path of a file of faults; empty for none
 ATTITUDE_STREAM = 1  # stream of a case's seed for the attitudes of a grid
 SOBOL_BITS = 30
 MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a whole
+TRACKER_PSF = "tracker"
 
 
 class Attitudes(Table, frozen=True):
@@ -112,9 +113,6 @@ class Varied(Table, frozen=True):
     maximum: Number | None = None
     steps: Annotated[int, Meta(ge=1, le=MAX_VALUES)] | None = None
     scale: Literal["linear", "log"] = "linear"
-
-
-TRACKER_PSF = "tracker"
 
 
 class Centroiding(Table, frozen=True):

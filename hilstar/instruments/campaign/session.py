@@ -43,18 +43,6 @@ from hilstar.server.bench.config import GAUSSIAN
 IMAGES = "images"
 OWN_THREADS = "LP_NUM_THREADS", "OMP_NUM_THREADS"  # threads that draw, and that make noise
 IMAGES_A_FOLDER = 1000
-
-
-class Identity(msgspec.Struct, frozen=True):
-    """Everything by which rows could differ between machines: program, libraries and renderer."""
-
-    hilstar: str
-    code_sha256: str
-    numpy: str
-    scipy: str
-    gl_renderer: str
-
-
 WORDS = {
     "hilstar": "hilstar {0}, and the campaign is of {1}; install that version there",
     "code_sha256": (
@@ -68,6 +56,16 @@ WORDS = {
         " machines of one kind"
     ),
 }
+
+
+class Identity(msgspec.Struct, frozen=True):
+    """Everything by which rows could differ between machines: program, libraries and renderer."""
+
+    hilstar: str
+    code_sha256: str
+    numpy: str
+    scipy: str
+    gl_renderer: str
 
 
 @functools.cache

@@ -47,6 +47,13 @@ READINGS_A_ROUND = 8  # between one black and white and the next
 # stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
 LIBRARY_MAG = 0.013
 SKY = (("star_flux", "mag"), ("star_place_along", "arcsec"), ("star_place_across", "arcsec"))
+KINDS = (
+    ("levels", "levels"),
+    ("even", "even"),
+    ("place_arcsec", "place"),
+    ("delay_ms", "delay"),
+    ("late_ms", "late"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,15 +181,6 @@ def assemble(
         return np.concatenate([found, sky.reshape(trials, -1)], axis=1)
 
     return Assembled([each.input for each in effects], model, names, figures, missing)
-
-
-KINDS = (
-    ("levels", "levels"),
-    ("even", "even"),
-    ("place_arcsec", "place"),
-    ("delay_ms", "delay"),
-    ("late_ms", "late"),
-)
 
 
 def _of_readings(

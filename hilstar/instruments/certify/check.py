@@ -56,6 +56,11 @@ TOLERANCES = {
     "psf": (1.0, "%"),
     "latency": (0.1, "ms"),
 }
+DRAWN = (
+    ("brightness", "brightness [%]"),
+    ("shift_x", "shift along x [arcsec]"),
+    ("psf", "PSF sigma [%]"),
+)
 
 
 class CheckReadings(msgspec.Struct, frozen=True, kw_only=True):
@@ -360,13 +365,6 @@ def record(
     write_csv(path, columns, ([row[name] for name in columns] for row in rows))
     draw_checks(folder / CHART, rows)
     return rows
-
-
-DRAWN = (
-    ("brightness", "brightness [%]"),
-    ("shift_x", "shift along x [arcsec]"),
-    ("psf", "PSF sigma [%]"),
-)
 
 
 def draw_checks(path: Path, rows: list[dict[str, str]]) -> None:

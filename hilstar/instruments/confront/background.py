@@ -21,6 +21,20 @@ FOUND_SIGMAS = 4.0
 
 KINDS = ("response", "offsets_dn", "columns_dn", "rows_dn")
 NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
+EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
+MIN_BLOCKS = 12  # along the shorter side; a block is 64 px or less
+BLOCK_PX = 64
+MIN_BLOCK_PX = 16
+CLIP = 2.5  # sigmas beyond which a pixel of a block is a star's
+CLIPPED = 0.9543  # sigma of a normal distribution cut at 2.5 sigma
+ROUNDS = 4
+BRIGHT_BLOCK, NOISY_BLOCK = 0.5, 1.2  # sigmas over its neighbours' median, and times their noise
+MIN_RING_PX = 100
+KERNEL_PX = 1.0  # sigma of the Gaussian by which sources are looked for
+THRESHOLD = 5.0
+MIN_TRAIL_PX, MIN_TRAIL_RATIO = 18.0, 5.0
+MAX_SOURCES = 20_000
+MAX_MASK_PX = 80  # half of what is left out about a long source
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,16 +180,6 @@ class _Pairs:
         return product, variance / math.sqrt(max(self.pairs, 1.0))
 
 
-EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
-MIN_BLOCKS = 12  # along the shorter side; a block is 64 px or less
-BLOCK_PX = 64
-MIN_BLOCK_PX = 16
-CLIP = 2.5  # sigmas beyond which a pixel of a block is a star's
-CLIPPED = 0.9543  # sigma of a normal distribution cut at 2.5 sigma
-ROUNDS = 4
-BRIGHT_BLOCK, NOISY_BLOCK = 0.5, 1.2  # sigmas over its neighbours' median, and times their noise
-
-
 @dataclass(frozen=True, slots=True)
 class SkyLevel:
     """Level and noise (height, width) of a photograph between its stars, DN, and whether a pixel
@@ -259,14 +263,6 @@ def _between(blocks: FloatArray, rows: FloatArray, columns: FloatArray) -> Float
         beyond = (at - inner).reshape((-1, 1) if axis == 0 else (1, -1))
         blocks = spline(inner) + slope * beyond
     return np.asarray(blocks)
-
-
-MIN_RING_PX = 100
-KERNEL_PX = 1.0  # sigma of the Gaussian by which sources are looked for
-THRESHOLD = 5.0
-MIN_TRAIL_PX, MIN_TRAIL_RATIO = 18.0, 5.0
-MAX_SOURCES = 20_000
-MAX_MASK_PX = 80  # half of what is left out about a long source
 
 
 @dataclass(frozen=True, slots=True)

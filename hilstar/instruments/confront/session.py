@@ -97,6 +97,8 @@ SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
 SCATTER_SNR = 10.0
 LINEAR_DONE = 0.004
 MAX_TONE_STEP, MIN_POWER = 0.4, 0.1
+PIVOT_NM = 550.0
+KNOT_NM = 20.0
 
 
 @dataclass(slots=True)
@@ -688,10 +690,6 @@ class _Magnitudes:
             rates = channel_rates(self._file.config.sky, optics)
             self._kept[correction] = magnitude(rates(*self._columns))
         return self._kept[correction]
-
-
-PIVOT_NM = 550.0
-KNOT_NM = 20.0
 
 
 def corrected(curve: Curve, correction: Correction) -> Curve:

@@ -17,6 +17,12 @@ from hilstar.server.sender import PATIENCE_S, SerialSender, open_sender
 FORMATS = ("packet", "json")
 MAX_BABBLE_BYTES = 300  # between two answers
 STAR_DECIMALS = 4
+MODE_FLAGS = {
+    TRACKING: protocol.ANSWER_TRACKING,
+    LOST: protocol.ANSWER_LOST_IN_SPACE,
+    TOO_FEW: protocol.ANSWER_TOO_FEW_STARS,
+    BLINDED: protocol.ANSWER_BLINDED,
+}
 
 
 def json_answer(answer: Answer) -> bytes:
@@ -40,14 +46,6 @@ def json_answer(answer: Answer) -> bytes:
         if star[-1] is None:
             star.pop()
     return msgspec.json.encode(said)
-
-
-MODE_FLAGS = {
-    TRACKING: protocol.ANSWER_TRACKING,
-    LOST: protocol.ANSWER_LOST_IN_SPACE,
-    TOO_FEW: protocol.ANSWER_TOO_FEW_STARS,
-    BLINDED: protocol.ANSWER_BLINDED,
-}
 
 
 def answer_packet(answer: Answer, sequence: int) -> AnswerPacket:

@@ -46,6 +46,7 @@ ROLL = 4.0
 FOV_PERIOD_PX = 400.0
 MIN_FORWARD = 0.05
 SILENT_AFTER_S = 5.0
+MAX_ERRORS = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,9 +153,6 @@ class TrackerTally:
             | spread
             | {"own_bias_arcsec": bias, "own_sigma_arcsec": sigma}
         )
-
-
-MAX_ERRORS = 100_000
 
 
 class TrackerProcess:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+OWN = "field"
+
 
 @dataclass(frozen=True, slots=True)
 class Field:
@@ -19,7 +21,6 @@ FIELDS = (
     Field("rosetta", "zeta Cas before the Rosetta NAVCAM", (9.122, 53.817, 0.0), 2920),
 )
 ZETA_CAS = Field("zeta_cas", "zeta Cas", FIELDS[2].radec_roll_deg, FIELDS[2].zoom_hip)
-OWN = "field"
 
 
 def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field, ...]:

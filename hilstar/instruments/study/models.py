@@ -127,6 +127,17 @@ DARK_LAWS: dict[str, dict[str, Any]] = {
 COLD_K = 273.0
 CORNERS_HZ = (0.0, 1e4, 1e5)
 ZODIACAL_V_MAG, ZODIACAL_NM = 22.1, (330.0, 1100.0)
+BRIGHT_V_MAG = 7.5
+HELD_OUT = "pickles, leave-one-out"
+BY_TYPE = "mk, leave-one-out"
+SETTINGS = [
+    Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS
+]
+# where Torres 2010 holds; exact at 0, where wang2021 steps
+SCALE_BV_MAG = np.arange(-35, 181) / 100
+BV_MAG = np.arange(-30, 201) / 100
+WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
+MIN_STARS = 20
 
 
 def catalogue_errors(directory: Path) -> ChartFinding:
@@ -423,21 +434,6 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
 
 
 FIGURES = (catalogue_errors, passbands, curves, detector_laws, zodiacal_spectrum)
-
-
-BRIGHT_V_MAG = 7.5
-HELD_OUT = "pickles, leave-one-out"
-BY_TYPE = "mk, leave-one-out"
-
-SETTINGS = [
-    Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS
-]
-# where Torres 2010 holds; exact at 0, where wang2021 steps
-SCALE_BV_MAG = np.arange(-35, 181) / 100
-
-BV_MAG = np.arange(-30, 201) / 100
-WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
-MIN_STARS = 20
 
 
 def spectra(directory: Path) -> ChartFinding:

@@ -77,6 +77,31 @@ STRIPE_PANEL = PanelSpec(
         "frameon": False,
     },
 )
+RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
+PACKET_HZ = 200
+RATE_DEG_S = 1.0
+BEAT_PHASES = 801  # of the lines that are foretold
+BEAT_NOTE = (
+    "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit"
+    " have no beat."
+)
+TIMING_NOTE = (
+    "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to"
+    " the one above it."
+)
+PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
+STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
+MARKERS = "osd^"
+STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
+ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
+RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
+QUICK_RATES_DEG_S = (2.0,)
+DRAW_TO_SWAP_S = 0.010
+EXPOSURE_S = 0.1
+START_S = 0.0037  # exposure start within a refresh period
+REFRESH_MS = 1e3 / 60  # the default of a bench file
+FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
+COST_ROUNDS = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,25 +224,6 @@ def stripe_case(point: StripePoint) -> StripeCase:
     return StripeCase(point.refreshes, point.lit_ms)
 
 
-RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
-PACKET_HZ = 200
-RATE_DEG_S = 1.0
-BEAT_PHASES = 801  # of the lines that are foretold
-BEAT_NOTE = (
-    "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit"
-    " have no beat."
-)
-TIMING_NOTE = (
-    "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to"
-    " the one above it."
-)
-PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
-STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
-MARKERS = "osd^"
-STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
-ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
-RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
-QUICK_RATES_DEG_S = (2.0,)
 # A window reaches the largest error here and the PSF beyond a star's path.
 
 
@@ -240,12 +246,6 @@ WAYS = {
     "+ scan-out": Compensation({"hold_ms": 0}, "on"),
     "+ smear": Compensation({}, "on"),
 }
-DRAW_TO_SWAP_S = 0.010
-EXPOSURE_S = 0.1
-START_S = 0.0037  # exposure start within a refresh period
-REFRESH_MS = 1e3 / 60  # the default of a bench file
-FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
-COST_ROUNDS = 9
 
 
 def frame_weights(

@@ -51,6 +51,10 @@ SURE, MAX_EXCUSED_S = 3.0, 0.3
 KNOWN_AGAIN_NS = NS_PER_S  # between two looks at how far this host's Unix time is off
 JUMPS = 3  # answers in a row that are later by JUMP_NS: the tracker's clock was set
 SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
+VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired", "unjudged")
+# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s;
+# residual; rate, arcsec/s.
+HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,12 +228,6 @@ def fitted_delay(
         if not (np.isfinite(off).all() and np.isfinite(variance) and variance >= 0):
             return None
     return DelayFit(float(fitted[3]), float(np.sqrt(variance)))
-
-
-VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired", "unjudged")
-# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s;
-# residual; rate, arcsec/s.
-HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
 
 
 class AnswerJudge:

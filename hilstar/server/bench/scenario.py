@@ -41,6 +41,11 @@ ADVICE = f"give the path of a scenario file (see {REFERENCE})"
 MAX_FAULTS = 256
 MAX_SURFACES = 16  # 8 MB each on a full HD monitor
 MAX_EDGES = 2000  # within one exposure
+MAX_ON = 64
+MAX_ASKED = 256
+SURFACES = (Glow, Gradient, MeasuredMap)  # each is drawn over the whole image
+MAX_SURFACES_ON = 8
+FILE = "file"  # who starts what a scenario has a time for
 
 
 class Head(Table, frozen=True):
@@ -218,13 +223,6 @@ class Timetable:
             if not stuck:
                 return since_ns
             since_ns = min(at_ns - one.since_ns for one in stuck)
-
-
-MAX_ON = 64
-MAX_ASKED = 256
-SURFACES = (Glow, Gradient, MeasuredMap)  # each is drawn over the whole image
-MAX_SURFACES_ON = 8
-FILE = "file"  # who starts what a scenario has a time for
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,19 @@ from hilstar.server.console import protocol
 FRAME = struct.Struct("<12qI")
 PICTURE = struct.Struct("<3q4I4d")
 STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
+_HEAD = struct.Struct("<Q")
+_SLOT = struct.Struct("<QQII")  # the number being written, the number that is whole, bytes, CRC-32
+_REQUEST = struct.Struct("<QQ")  # interval of pictures, and until when (host time), ns
+_WRONG_SINCE = struct.Struct("<d")  # UTC, s
+_PAGE = 4096
+FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
+STATES, STATE_BYTES = 4, 60_000
+EVENTS, EVENT_BYTES = 512, 2_000
+ANSWERS, ANSWER_BYTES = 16, 12_000
+PICTURES = 3
+MAX_SPRITES = 20_000
+SPRITE = np.dtype([("star", "<i4"), ("x_px", "<f4"), ("y_px", "<f4")])
+PICTURE_HEAD_BYTES = 128
 
 
 class FrameNumbers(NamedTuple):
@@ -155,21 +168,6 @@ class Setup(msgspec.Struct, kw_only=True):
     pace: Pace
     scene: bytes = b""  # a pickled `overlay.OverlayScene`
     scpi: ScpiSetup | None = None
-
-
-_HEAD = struct.Struct("<Q")
-_SLOT = struct.Struct("<QQII")  # the number being written, the number that is whole, bytes, CRC-32
-_REQUEST = struct.Struct("<QQ")  # interval of pictures, and until when (host time), ns
-_WRONG_SINCE = struct.Struct("<d")  # UTC, s
-_PAGE = 4096
-FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
-STATES, STATE_BYTES = 4, 60_000
-EVENTS, EVENT_BYTES = 512, 2_000
-ANSWERS, ANSWER_BYTES = 16, 12_000
-PICTURES = 3
-MAX_SPRITES = 20_000
-SPRITE = np.dtype([("star", "<i4"), ("x_px", "<f4"), ("y_px", "<f4")])
-PICTURE_HEAD_BYTES = 128
 
 
 class Ring:

@@ -44,6 +44,21 @@ if TYPE_CHECKING:
     from hilstar.server.serve import Running
 
 MIN_PICTURE_NS = NS_PER_S // 10
+MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
+# Lasting events that keep the ledger from being written, as `run.record.ledger` names them.
+LEDGER_TROUBLES = {
+    "ledger-failed": "cannot be written",
+    "ledger-lost": "a file was deleted, truncated or overwritten",
+    "ledger-stalled": "the disk accepts nothing",
+    "ledger-thin": "the disk is full: frames are not recorded",
+}
+LOOP_WAITS_S = 2.0
+POLL_S = 0.004
+MAX_MARK_CHARACTERS = 200
+MAX_WHO_CHARACTERS = 60
+MAX_NAMES = 5000  # the brightest stars without a HIP number
+CODE_BYTES = 2
+FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
 
 
 class FramePublisher:
@@ -131,16 +146,6 @@ class FramePublisher:
             shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q
         )
         self._memory.put_picture(head, levels, places)
-
-
-MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
-# Lasting events that keep the ledger from being written, as `run.record.ledger` names them.
-LEDGER_TROUBLES = {
-    "ledger-failed": "cannot be written",
-    "ledger-lost": "a file was deleted, truncated or overwritten",
-    "ledger-stalled": "the disk accepts nothing",
-    "ledger-thin": "the disk is full: frames are not recorded",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,12 +263,6 @@ def _clock(running: "Running") -> protocol.ShownClock | None:
         synchronised=clock.mode in KNOWN_MODES,
         mode=clock.mode,
     )
-
-
-LOOP_WAITS_S = 2.0
-POLL_S = 0.004
-MAX_MARK_CHARACTERS = 200
-MAX_WHO_CHARACTERS = 60
 
 
 Done = tuple[int, str]  # what became of an order: an HTTP status and a line
@@ -423,9 +422,6 @@ def setup_for(
     )
 
 
-MAX_NAMES = 5000  # the brightest stars without a HIP number
-
-
 def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
     """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids
     already.
@@ -475,10 +471,6 @@ def opened_page(
         setup, memory, listeners, WatchedRun(feed, parts).now, parts.notices, orders.do
     ):
         yield feed, requests
-
-
-CODE_BYTES = 2
-FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
 
 
 class _SessionNotices(Notices):

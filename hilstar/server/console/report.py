@@ -49,6 +49,30 @@ LINKS = re.compile(
     r'^<(?:link rel="(?:icon|stylesheet)"|script type="module"|script src=).*\n', re.MULTILINE
 )
 UPLOT, UPLOT_STYLE = "uplot.min.js", "uplot.min.css"  # of npm's uplot 1.6.32, as published
+MAX_BYTES = 3_000_000  # all pictures together, packed
+NO_BENCH = "the ledger's head has no bench file"
+CAUTION = (
+    "Drawn by a bench that is not the run's own: a file that it names has changed since, or another"
+    " version of hilstar wrote the ledger. Codes may differ from those shown."
+)
+BINS = 60
+HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
+MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relative to its values
+MS_DIGITS, S_DIGITS, Q_DIGITS, ANGLE_DIGITS = 3, 3, 8, 6
+MAX_WHO_CHARACTERS = 60
+IN_ARCSEC_DEG = 0.2  # a motion over less is drawn in arcsec
+# beyond it right ascension and roll say nothing: turns about the camera's axes are drawn
+POLE_DEG = 88.0
+NAMES = ("RA \N{MULTIPLICATION SIGN} cos Dec", "Dec", "roll")
+AXES = ("about x (right)", "about y (down)", "about z (boresight)")
+DISTRIBUTIONS = {
+    "interval": "Interval between swaps",
+    "late": "Swap later than predicted",
+    "draw": "Start of drawing to swap",
+    "age": "Age of the attitude at light",
+    "prediction": "Predicted past the last packet",
+    "packet": "Packet received to swap",
+}
 
 
 def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
@@ -116,14 +140,6 @@ def report_page(data: dict[str, Any]) -> str:
     html = LINKS.sub("", html).replace('data-mode="live"', 'data-mode="report"')
     # The data come before the script that reads them, and both after the page's own text.
     return html.replace("</head>", f"{head}</head>").replace("</body>", f"{tail}</body>")
-
-
-MAX_BYTES = 3_000_000  # all pictures together, packed
-NO_BENCH = "the ledger's head has no bench file"
-CAUTION = (
-    "Drawn by a bench that is not the run's own: a file that it names has changed since, or another"
-    " version of hilstar wrote the ledger. Codes may differ from those shown."
-)
 
 
 class _Unreported(Notices):
@@ -215,26 +231,6 @@ def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
         "data": base64.b64encode(zlib.compress(data, 9)).decode(),
         "truth": truth,
     }
-
-
-BINS = 60
-HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
-MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relative to its values
-MS_DIGITS, S_DIGITS, Q_DIGITS, ANGLE_DIGITS = 3, 3, 8, 6
-MAX_WHO_CHARACTERS = 60
-IN_ARCSEC_DEG = 0.2  # a motion over less is drawn in arcsec
-# beyond it right ascension and roll say nothing: turns about the camera's axes are drawn
-POLE_DEG = 88.0
-NAMES = ("RA \N{MULTIPLICATION SIGN} cos Dec", "Dec", "roll")
-AXES = ("about x (right)", "about y (down)", "about z (boresight)")
-DISTRIBUTIONS = {
-    "interval": "Interval between swaps",
-    "late": "Swap later than predicted",
-    "draw": "Start of drawing to swap",
-    "age": "Age of the attitude at light",
-    "prediction": "Predicted past the last packet",
-    "packet": "Packet received to swap",
-}
 
 
 def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:

@@ -73,6 +73,24 @@ ERRORS_WAIT, QUESTIONABLE, MESSAGE_WAITS, STANDARD_EVENT, MASTER, OPERATION = 4,
 Kind = Literal["number", "word", "string"]
 # the error where that kind does not belong
 KINDS: dict[Kind, int] = {"number": -128, "word": -148, "string": -158}
+NODE = re.compile(r"(\[)?:?([A-Za-z*]+)\]?")
+HEADER = re.compile(
+    r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)"
+)
+NUMBER = re.compile(
+    r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?["
+    r" \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?"
+)
+INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
+WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+# All but tab, LF and CR.
+CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+WHITE = re.compile(rb"[ \t\r]+")
+# A request line of HTTP (RFC 9112, 3): a method in any case, a target, and since HTTP/1.0 a
+# version. Either end tells it from SCPI, whose headers have a colon before what follows a blank,
+# and whose lines never end with a version.
+REQUEST_BEGINS = re.compile(rb"[ \t]*[A-Za-z][A-Za-z0-9_-]*[ \t]+(?:/|[A-Za-z][A-Za-z0-9+.-]*://)")
+REQUEST_ENDS = re.compile(rb"[ ]HTTP/\d+(?:\.\d+)?[ ]?\Z", re.IGNORECASE)
 
 
 class ScpiError(Exception):
@@ -107,18 +125,6 @@ class Unit(NamedTuple):
 
     pattern: str
     parameters: tuple[Parameter, ...]
-
-
-NODE = re.compile(r"(\[)?:?([A-Za-z*]+)\]?")
-HEADER = re.compile(
-    r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)"
-)
-NUMBER = re.compile(
-    r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?["
-    r" \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?"
-)
-INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
-WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 class Headers:
@@ -357,16 +363,6 @@ class NotScpi(Exception):
     """Something came that no test stand sends, and the connection has to be closed; the message
     says what.
     """
-
-
-# All but tab, LF and CR.
-CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
-WHITE = re.compile(rb"[ \t\r]+")
-# A request line of HTTP (RFC 9112, 3): a method in any case, a target, and since HTTP/1.0 a
-# version. Either end tells it from SCPI, whose headers have a colon before what follows a blank,
-# and whose lines never end with a version.
-REQUEST_BEGINS = re.compile(rb"[ \t]*[A-Za-z][A-Za-z0-9_-]*[ \t]+(?:/|[A-Za-z][A-Za-z0-9+.-]*://)")
-REQUEST_ENDS = re.compile(rb"[ ]HTTP/\d+(?:\.\d+)?[ ]?\Z", re.IGNORECASE)
 
 
 class LineBuffer:

@@ -55,6 +55,9 @@ USER_NAME_BYTES = 16
 
 MIN_EXPOSURE_US, MAX_EXPOSURE_US = 10.0, 60e6
 MIN_RATE_HZ, MAX_GAIN_DB = 0.01, 24.0
+ACQUISITION_MODES = {"Continuous": 0, "SingleFrame": 1, "MultiFrame": 2}
+# A client that grabs holds these: images of two formats would look alike on the wire.
+LOCKED_WHILE_STREAMING = {"PixelFormat", "AcquisitionMode", "AcquisitionFrameCount"}
 
 
 class GvcpStatus(IntEnum):
@@ -116,7 +119,6 @@ class Feature:
     entries: Mapping[str, int] = field(default_factory=dict)
 
 
-ACQUISITION_MODES = {"Continuous": 0, "SingleFrame": 1, "MultiFrame": 2}
 FEATURES = (
     Feature("Width", "integer", "ImageFormatControl", "RO", "Columns of an image.", "px"),
     Feature("Height", "integer", "ImageFormatControl", "RO", "Rows of an image.", "px"),
@@ -175,8 +177,6 @@ ADDRESSES = {
     feature.name: FEATURES_AT + WORD_BYTES * index for index, feature in enumerate(FEATURES)
 }
 BY_ADDRESS = {ADDRESSES[feature.name]: feature for feature in FEATURES}
-# A client that grabs holds these: images of two formats would look alike on the wire.
-LOCKED_WHILE_STREAMING = {"PixelFormat", "AcquisitionMode", "AcquisitionFrameCount"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ JUMP_RAD, JUMP_RATIO = np.radians(0.02), 4.0
 SAME_RAD = 1e-9  # two frames of one attitude are joined whatever lies between them
 UNEVEN = 1.6  # largest ratio of neighbouring intervals for a cubic through four frames
 NOT_SHOWN = (np.nan,) * 4
+NO_SPANS = np.zeros((0, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +45,6 @@ class Moments:
     rate_rad_s: FloatArray
     known: npt.NDArray[np.bool_]
     held_s: FloatArray
-
-
-NO_SPANS = np.zeros((0, 2))
 
 
 class Commanded:

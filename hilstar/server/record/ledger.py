@@ -65,6 +65,22 @@ MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stal
 FRAMES_SHARE = 0.5  # frames may use this share of it; the rest is for packets
 # Approximate size of a JSON message and its objects; a packet's raw bytes are added.
 ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000, "answer": 4000}
+NO_ROOM = "no room"  # the reason given for lost messages
+FLUSH_S = 0.2
+EACH_S = 1.0  # how often counts, the process and the disk are looked at
+MAX_CHUNK_BYTES = 1_000_000
+MAX_DETAIL_CHARACTERS = 200
+# for a disk that stalls at the end, without and with a signal
+DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4
+MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
+STALLED_S = 5.0  # since the writer's last pass
+LOW_SHARE, WELL_SHARE = 0.10, 0.12  # shares of the disk
+# reserved for packets, the smaller of the two
+FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02
+TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
+    key: JsonTopic(topic, f"hilstar.{key.title()}", schema_of(record, f"hilstar.{key.title()}"))
+    for key, (topic, record) in RECORDS.items()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,20 +228,6 @@ class ProcessProbe:
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
-
-
-NO_ROOM = "no room"  # the reason given for lost messages
-FLUSH_S = 0.2
-EACH_S = 1.0  # how often counts, the process and the disk are looked at
-MAX_CHUNK_BYTES = 1_000_000
-MAX_DETAIL_CHARACTERS = 200
-# for a disk that stalls at the end, without and with a signal
-DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4
-MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
-STALLED_S = 5.0  # since the writer's last pass
-LOW_SHARE, WELL_SHARE = 0.10, 0.12  # shares of the disk
-# reserved for packets, the smaller of the two
-FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -589,12 +591,6 @@ class Ledger(Closing):
         if self._part:
             told["files"] = self._part + 1
         return told
-
-
-TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
-    key: JsonTopic(topic, f"hilstar.{key.title()}", schema_of(record, f"hilstar.{key.title()}"))
-    for key, (topic, record) in RECORDS.items()
-}
 
 
 def event_record(notice: Notice) -> EventRecord:

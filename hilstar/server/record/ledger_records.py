@@ -60,6 +60,27 @@ HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, whic
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+_KINDS: dict[Any, str] = {
+    float: "number",
+    float | None: "number",
+    str: "string",
+    bool: "boolean",
+} | dict.fromkeys(
+    (
+        int,
+        int | None,
+        HostNs,
+        HostNs | None,
+        AnyNs,
+        AnyNs | None,
+        Count,
+        Count | None,
+        Marker | None,
+    ),
+    "integer",
+)
+NO_FRAMES = "has no frames; give the ledger of serve or replay --ledger"
+MAX_REASONS, MAX_REASON_CHARACTERS = 50, 40
 
 
 class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
@@ -103,27 +124,6 @@ class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
     hidden: str = ""
     faults: tuple[Count, ...] = ()
     fault_since_ns: tuple[AnyNs, ...] = ()
-
-
-_KINDS: dict[Any, str] = {
-    float: "number",
-    float | None: "number",
-    str: "string",
-    bool: "boolean",
-} | dict.fromkeys(
-    (
-        int,
-        int | None,
-        HostNs,
-        HostNs | None,
-        AnyNs,
-        AnyNs | None,
-        Count,
-        Count | None,
-        Marker | None,
-    ),
-    "integer",
-)
 
 
 def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
@@ -351,10 +351,6 @@ def below_step(bench: Bench, shown: Shown) -> int:
 
 def _within_64_bits(value_ns: int) -> int:
     return min(max(value_ns, -(2**63)), 2**63 - 1)
-
-
-NO_FRAMES = "has no frames; give the ledger of serve or replay --ledger"
-MAX_REASONS, MAX_REASON_CHARACTERS = 50, 40
 
 
 def frame_records(path: Path, *, tell: bool = True) -> Iterator[FrameRecord]:

@@ -44,6 +44,41 @@ from hilstar.server.record.ledger_records import (
 SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
 SPANS = 8192  # in which a run is drawn along its time
 BLOCK = 4096  # records that are added at once
+MEGABYTE = 1e6
+WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
+KEYFRAMES = 16
+MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
+SMALL_RAD = 1e-8
+# newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
+RECOUNTED = 8192
+# Times of a frame, ms, and the keys that a report has them under.
+METRICS = {
+    **{
+        "interval": "interval_ms",
+        "late": "swap_late_ms",
+        "draw": "draw_to_swap_ms",
+        "age": "attitude_age_ms",
+    },
+    **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
+}
+HEAD = (
+    "bench_sha256",
+    "calibration",
+    "calibration_sha256",
+    "certificate",
+    "gl_renderer",
+    "gl_version",
+    "render_path",
+)
+FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames", "wrong_frames")
+COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
+# The columns of the spans: METRICS, then these.
+COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
+ACCEPTED, REFUSED = range(2)
+NUMBERS, WORDS = (
+    ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"),
+    ("operator", "hidden"),
+)
 
 
 class ThinnedRows:
@@ -184,15 +219,6 @@ class TimeBins:
         return begin_s, self._counts[: self._used].astype(np.float64) * (NS_PER_S / self.width_ns)
 
 
-MEGABYTE = 1e6
-WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
-KEYFRAMES = 16
-MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
-SMALL_RAD = 1e-8
-# newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
-RECOUNTED = 8192
-
-
 class Keyframes:
     """Frames of a run to be drawn in its report: some evenly over the run, and the first or
     worst of each kind.
@@ -219,36 +245,6 @@ class Keyframes:
         if last is not None:
             found.setdefault(id(last), (last, ""))
         return sorted(found.values(), key=lambda each: each[0].swap_ns)
-
-
-# Times of a frame, ms, and the keys that a report has them under.
-METRICS = {
-    **{
-        "interval": "interval_ms",
-        "late": "swap_late_ms",
-        "draw": "draw_to_swap_ms",
-        "age": "attitude_age_ms",
-    },
-    **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
-}
-HEAD = (
-    "bench_sha256",
-    "calibration",
-    "calibration_sha256",
-    "certificate",
-    "gl_renderer",
-    "gl_version",
-    "render_path",
-)
-FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames", "wrong_frames")
-COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
-# The columns of the spans: METRICS, then these.
-COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
-ACCEPTED, REFUSED = range(2)
-NUMBERS, WORDS = (
-    ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"),
-    ("operator", "hidden"),
-)
 
 
 @dataclass(slots=True)

@@ -27,6 +27,10 @@ KEYS = {"b": "blank", "c": "crosshair", "g": "grid", "t": "patch", "space": "pau
 # bits of the photodiode square: its light in any 7 successive frames tells which frames they are
 CODE_BITS = 7
 log = logging.getLogger(__name__)
+CHANGED = (
+    "another program changed the display's gamma ramp: codes make other light; stop it (night"
+    " light, colord, redshift)"
+)
 
 
 def maximal_sequence() -> tuple[int, ...]:
@@ -244,12 +248,6 @@ class Screen:
                 case key if key in KEYS:
                     self.aids.toggle(KEYS[key])
         return swap_ns
-
-
-CHANGED = (
-    "another program changed the display's gamma ramp: codes make other light; stop it (night"
-    " light, colord, redshift)"
-)
 
 
 class DisplayPacer(Pacer):

@@ -75,6 +75,9 @@ POLES_DEG = {
 }
 LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
 NORTH = np.array([0.0, 0.0, 1.0])
+LOWEST_KM = 1.0  # an orbit below the ground is seen from here
+AT_CENTRE_KM = 1000.0  # an observer so near the centre has no place of its own: no Earth is seen
+DARK_V_MAG = 40.0  # where nothing in view is lit
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,9 +340,6 @@ def lunar_share(phase_deg: float) -> float:
 # 8.4 km), and the depth that Bodhaine et al. 1999 (J. Atmos. Oceanic Technol. 16, 1854) have at 550
 # nm. Dust is lower than rays that get through.
 AIR = Air(scale_km=8.0, depth=0.097)
-LOWEST_KM = 1.0  # an orbit below the ground is seen from here
-AT_CENTRE_KM = 1000.0  # an observer so near the centre has no place of its own: no Earth is seen
-DARK_V_MAG = 40.0  # where nothing in view is lit
 
 
 def at_centre(place_km: FloatArray) -> bool:

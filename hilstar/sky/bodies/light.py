@@ -86,6 +86,7 @@ MOON_ALBEDO = (
     0.0634,
 )
 B_NM, V_NM = 438.0, 545.0
+_POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URANUS_POLE_DEG)}
 
 
 def body_v_mag(
@@ -147,9 +148,6 @@ def latitude_deg(pole: FloatArray, towards_body: FloatArray) -> float:
     return float(
         np.degrees(np.arcsin(np.clip(-pole @ towards_body / np.linalg.norm(towards_body), -1, 1)))
     )
-
-
-_POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URANUS_POLE_DEG)}
 
 
 def bodies_electrons_per_s(

@@ -52,6 +52,13 @@ MAX_FILE_BYTES = 2_000_000_000
 KIND = "hilstar first light 1"
 SESSION_FILE = "session.json"
 ADVICE = "give the directory of a first-light session, or a new one"
+INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
+# Figures of the step `orientation`: the monitor's camera as the figure was seen, with its
+# q_cam_to_mon.
+SEEN_FOCAL, SEEN_Q = "seen_focal_length_px", ("seen_qw", "seen_qx", "seen_qy", "seen_qz")
+MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
+HOT_FILL = 0.5  # a pixel above this in the dark frame is hot, and is not used
+LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 
 
 class KeyChange(msgspec.Struct, frozen=True, kw_only=True):
@@ -198,9 +205,6 @@ def sha256_of(path: Path) -> str:
     return hashlib.sha256(read_bytes(path, ADVICE, MAX_FILE_BYTES)).hexdigest()
 
 
-INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
-
-
 def with_changes(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
     """The bench file with the changes, without writing it. Raises InputError where a key cannot
     be set in this file.
@@ -227,14 +231,6 @@ def rewrite(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
         return file
     write_whole(file.path, with_changes(file, changes).text)
     return read_bench_file(file.path)
-
-
-# Figures of the step `orientation`: the monitor's camera as the figure was seen, with its
-# q_cam_to_mon.
-SEEN_FOCAL, SEEN_Q = "seen_focal_length_px", ("seen_qw", "seen_qx", "seen_qy", "seen_qz")
-MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
-HOT_FILL = 0.5  # a pixel above this in the dark frame is hot, and is not used
-LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 
 
 @dataclass(frozen=True, slots=True)

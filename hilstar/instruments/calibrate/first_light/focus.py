@@ -69,6 +69,17 @@ EDGE_SHARE = 3.5e-4
 FLUX_FLOOR = 1e-9
 # a dot whose own sigma is so far from the others' has a neighbour, dust or a dead pixel
 WILD_SIGMAS = 5.0
+PLAN_SEED = 0
+FIRST_FRAMES = 8  # of dots where the figure of `orientation` says that the tracker looks
+FIRST_LIT_DOTS = 18  # in a frame: 48 dots, of 56 codes of three frames in eight
+OVERSAMPLING = 4  # for the effective PSF
+# times the bench file's sigma, and px: less is no reason to turn the focus
+BLURRED, BLURRED_BY_PX = 1.3, 0.1
+# Relative to the tracker's range: the brightest of a few dots. Of a thousand, one stands on a
+# pixel's middle where the screen is brightest, and later steps refuse what is over MAX_FILL.
+DOT_FILL = 0.6
+# of the PSF's sigma: with a larger error it cannot be told from the pixel's own width
+MAX_ERROR_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,19 +389,6 @@ def _each_sigma(
     each = np.clip(shape.sigma_px + steps, *SIGMAS_PX)
     far = np.abs(each - np.median(each))
     return each, far <= WILD_SIGMAS * 1.4826 * max(float(np.median(far)), 1e-3 * shape.sigma_px)
-
-
-PLAN_SEED = 0
-FIRST_FRAMES = 8  # of dots where the figure of `orientation` says that the tracker looks
-FIRST_LIT_DOTS = 18  # in a frame: 48 dots, of 56 codes of three frames in eight
-OVERSAMPLING = 4  # for the effective PSF
-# times the bench file's sigma, and px: less is no reason to turn the focus
-BLURRED, BLURRED_BY_PX = 1.3, 0.1
-# Relative to the tracker's range: the brightest of a few dots. Of a thousand, one stands on a
-# pixel's middle where the screen is brightest, and later steps refuse what is over MAX_FILL.
-DOT_FILL = 0.6
-# of the PSF's sigma: with a larger error it cannot be told from the pixel's own width
-MAX_ERROR_SHARE = 0.2
 
 
 class SharpDots(NamedTuple):

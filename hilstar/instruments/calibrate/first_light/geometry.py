@@ -55,6 +55,42 @@ FIGURE_REACH = 0.25
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
 # sides of the squares at the corner, to its right and below it, in those of the smallest
 SQUARES = (3, 2, 1)
+THRESHOLD_SIGMA = 8.0
+MIN_PIXELS = 3
+MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
+SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
+MAX_SCALE = 2.0
+# between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
+MIN_LIGHT_STEP = 1.3
+WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
+MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
+UPRIGHT = (1, 0, 0, 1)
+QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
+OBLIQUE_DEG = 40.0  # from the nearest right angle
+WAYS = {
+    UPRIGHT: "upright",
+    (-1, 0, 0, 1): "mirrored left to right",
+    (1, 0, 0, -1): "mirrored top to bottom",
+    (-1, 0, 0, -1): "turned by 180 degrees",
+    (0, -1, 1, 0): "turned by 90 degrees clockwise",
+    (0, 1, -1, 0): "turned by 270 degrees clockwise",
+    (0, 1, 1, 0): "with columns and rows swapped",
+    (0, -1, -1, 0): "with columns and rows swapped, and turned by 180 degrees",
+}
+CORNERS = {
+    (-1, -1): "top left",
+    (1, -1): "top right",
+    (-1, 1): "bottom left",
+    (1, 1): "bottom right",
+}
+SIDES = {(1, 0): "to its right", (-1, 0): "to its left", (0, 1): "below it", (0, -1): "above it"}
+NOT_SEEN = (
+    "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
+)
+FRAMES = 16  # of dots where the fit to the first ones says that the tracker looks
+MAX_TILT_DEG = 60.0  # of a geometry file
+FAR = 1.5  # times the noise of held-out dots: a lens that leaves more is not followed
+SQUARE_NAMES = ("corner", "right", "below")
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,40 +139,6 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
         middle_y + reach * np.array([-1.0, -1.0, 1.0]),
     )
     return OrientationFigure(x_px, y_px, side, reach)
-
-
-THRESHOLD_SIGMA = 8.0
-MIN_PIXELS = 3
-MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
-SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
-MAX_SCALE = 2.0
-# between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
-MIN_LIGHT_STEP = 1.3
-WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
-MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
-UPRIGHT = (1, 0, 0, 1)
-QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
-OBLIQUE_DEG = 40.0  # from the nearest right angle
-WAYS = {
-    UPRIGHT: "upright",
-    (-1, 0, 0, 1): "mirrored left to right",
-    (1, 0, 0, -1): "mirrored top to bottom",
-    (-1, 0, 0, -1): "turned by 180 degrees",
-    (0, -1, 1, 0): "turned by 90 degrees clockwise",
-    (0, 1, -1, 0): "turned by 270 degrees clockwise",
-    (0, 1, 1, 0): "with columns and rows swapped",
-    (0, -1, -1, 0): "with columns and rows swapped, and turned by 180 degrees",
-}
-CORNERS = {
-    (-1, -1): "top left",
-    (1, -1): "top right",
-    (-1, 1): "bottom left",
-    (1, 1): "bottom right",
-}
-SIDES = {(1, 0): "to its right", (-1, 0): "to its left", (0, 1): "below it", (0, -1): "above it"}
-NOT_SEEN = (
-    "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,11 +299,6 @@ def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> Scree
     )
 
 
-FRAMES = 16  # of dots where the fit to the first ones says that the tracker looks
-MAX_TILT_DEG = 60.0  # of a geometry file
-FAR = 1.5  # times the noise of held-out dots: a lens that leaves more is not followed
-
-
 def orientation(context: StepContext) -> StepOutcome:
     """Find how the screen is mounted, set the bench file's keys, and check that the figure is
     upright. Raises InputError.
@@ -384,9 +381,6 @@ def _way(
             code, tries = context.darker(code), tries + 1
         else:
             return found.way, (found, looked)
-
-
-SQUARE_NAMES = ("corner", "right", "below")
 
 
 def draw_spots(

@@ -59,6 +59,18 @@ if TYPE_CHECKING:
     from hilstar.display.window.window import Window
 
 CodeImage = npt.NDArray[np.uint16]
+ENDINGS = (".png", ".fits", ".fit", ".fts")
+PATTERN_FILE = "pattern.png"
+KIND = "code"  # a square that toggles leaves pairs of frames open
+POLL_S = 0.02
+SETTLE_S = 0.25  # for a panel that is slow to change
+SHOW_YOURSELF = "or show the patterns yourself: name {pattern} in --grab"
+# A pattern that stays is handed on again so often, for a watcher that came late.
+HANDED_ON_AGAIN_S = 0.5
+GRAB_TIMEOUT_S = 120.0
+STILL_S = 0.5  # a file that has not grown for so long is complete
+SWAP_JITTER_NS = 20_000
+MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +109,6 @@ def off_screen(screen: CodeImage, orientation: Orientation) -> CodeImage:
     screen = screen[::-1] if orientation.flip_y else screen
     screen = screen[:, ::-1] if orientation.flip_x else screen
     return np.rot90(screen, orientation.quarter_turns)
-
-
-ENDINGS = (".png", ".fits", ".fit", ".fts")
-PATTERN_FILE = "pattern.png"
 
 
 class NoImage(InputError):
@@ -183,9 +191,6 @@ def complete_images(folder: Path) -> dict[str, Path]:
     return {path.stem: path for path in found[:-1]}
 
 
-KIND = "code"  # a square that toggles leaves pairs of frames open
-
-
 @dataclass(frozen=True, slots=True)
 class DiodeRecording:
     """The square's changes at their swaps, and the edges that the photodiode saw."""
@@ -219,10 +224,7 @@ class SerialDiode:
             return DiodeRecording(shown, listening[0].result())
 
 
-POLL_S = 0.02
-SETTLE_S = 0.25  # for a panel that is slow to change
 log = logging.getLogger(__name__)
-SHOW_YOURSELF = "or show the patterns yourself: name {pattern} in --grab"
 
 
 class Stopped(HilstarError):
@@ -289,10 +291,6 @@ class PatternFrames:
         )
         lit_codes = flat[lit] if channels == 3 else flat[lit, 0]
         self._sender.put_frame(ShownFrame(head, lit.astype(np.uint32), lit_codes))
-
-
-# A pattern that stays is handed on again so often, for a watcher that came late.
-HANDED_ON_AGAIN_S = 0.5
 
 
 class PatternDisplay(Closing):
@@ -405,9 +403,6 @@ class PatternDisplay(Closing):
         if self._window is not None:
             self._window.close()
             self._window = None
-
-
-GRAB_TIMEOUT_S = 120.0
 
 
 class _ShownHere(ImageSource):
@@ -619,9 +614,6 @@ def _wait(done: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-STILL_S = 0.5  # a file that has not grown for so long is complete
-
-
 class ByHand(_ShownHere):
     """Images that a person saves. Each pattern stays on the display until its file is complete."""
 
@@ -690,10 +682,6 @@ def _saved(stem: Path) -> Path | None:
             if status.st_size > 0 and time.time() - status.st_mtime > STILL_S:
                 return path
     return None
-
-
-SWAP_JITTER_NS = 20_000
-MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
 class VirtualBench(ImageSource):

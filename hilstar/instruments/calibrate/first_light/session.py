@@ -52,6 +52,10 @@ from hilstar.server.sync import BeatSummary, beat_of
 
 WATCHED_S = 5.0  # about 150 edges at 60 Hz
 AGREE_MS = 0.05  # a smaller difference neither changes the bench file nor casts doubt on a scan-out
+MS_PER_S = 1000.0
+PROGRESS_S = 3.0
+BEFORE_FILE = "bench-before.toml"
+LOCK_FILE = ".lock"
 
 
 def latency(context: StepContext) -> StepOutcome:
@@ -113,9 +117,6 @@ def latency(context: StepContext) -> StepOutcome:
     )
 
 
-MS_PER_S = 1000.0
-
-
 def machine(context: StepContext) -> StepOutcome:
     """Check the machine. Raises MachineError for what it lacks."""
     found = examine()
@@ -152,11 +153,6 @@ def display(context: StepContext) -> StepOutcome:
         timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next"
     )
     return StepOutcome("done", line, figures, number=number)
-
-
-PROGRESS_S = 3.0
-BEFORE_FILE = "bench-before.toml"
-LOCK_FILE = ".lock"
 
 
 class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

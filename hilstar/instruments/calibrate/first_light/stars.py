@@ -47,6 +47,12 @@ P95_OF_TWO, P95_OF_ONE = 2.4477, 1.9600
 MAX_FRAMES = 25  # of a field that are taken without being asked for
 MAX_ASKED_FRAMES = 1000  # of a field: the most that first-light --frames takes
 GRID = 21  # places along each side of the screen at which a truth is compared
+READINGS_FILE = "readings.csv"  # stars and their DN, as `calibrate scale --reading` takes them
+AGREE_SIGMAS = 3.0  # less is no reason to change the bench file
+# Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag
+# rms from the truth.
+SYSTEMATIC_MAG = 0.002
+MAX_ARROW_SHARE = 0.06  # relative to the image's width
 
 
 def verify(context: StepContext) -> StepOutcome:
@@ -329,13 +335,6 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
     }
 
 
-READINGS_FILE = "readings.csv"  # stars and their DN, as `calibrate scale --reading` takes them
-AGREE_SIGMAS = 3.0  # less is no reason to change the bench file
-# Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag
-# rms from the truth.
-SYSTEMATIC_MAG = 0.002
-
-
 def scale(context: StepContext) -> StepOutcome:
     """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
     seen = see_stars(context)
@@ -477,9 +476,6 @@ def trend(
     variance = float((share * left**2).sum()) * len(x) / max(len(x) - 2, 1)
     alike = 1 / float((share**2).sum())
     return slope * span, math.sqrt(variance / (alike * leverage)) * span
-
-
-MAX_ARROW_SHARE = 0.06  # relative to the image's width
 
 
 def draw_light(

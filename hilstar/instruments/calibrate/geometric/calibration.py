@@ -55,6 +55,20 @@ DEFAULT_NOISE_PX = 0.05
 # off by noise / sqrt(frames).
 MAX_MISFIT = 4.0
 MISFIT_FLOOR_ARCSEC = 1.0
+ONE_POSE = (
+    "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file"
+    " holds both"
+)
+COLLIMATOR_ALONE = (
+    "one pose, with the tracker's lens as its flight model says: this file holds the collimator"
+    " alone"
+)
+ROUND = (
+    "poses turned about the boresight do not tell apart distortions that are round about it; they"
+    " are in the stated error"
+)
+WIDE_INCH = 5.6  # width of a panel
+ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the screen's width
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,22 +368,6 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
                     f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part}"
                     " of the screen: look for what covers or dims it, and take new frames"
                 )
-
-
-ONE_POSE = (
-    "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file"
-    " holds both"
-)
-COLLIMATOR_ALONE = (
-    "one pose, with the tracker's lens as its flight model says: this file holds the collimator"
-    " alone"
-)
-ROUND = (
-    "poses turned about the boresight do not tell apart distortions that are round about it; they"
-    " are in the stated error"
-)
-WIDE_INCH = 5.6  # width of a panel
-ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the screen's width
 
 
 class FittedParameter(NamedTuple):

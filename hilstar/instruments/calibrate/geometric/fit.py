@@ -39,6 +39,27 @@ POSE_STEP_RAD = 0.01
 PINHOLE = ("rotation_x", "rotation_y", "rotation_z", "log_focal")
 RADIAL = (*PINHOLE, "k1")
 BROWN_CONRADY = tuple(STEPS)
+HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
+PRIOR = 0.3  # weight on a parameter's number: so weak that it decides only what the data leave open
+# Weight on the tracker's radial terms, which the collimator's can replace. Free, they follow what
+# neither lens can follow. How well they are known is a matter of PRIOR all the same.
+ROUND_PRIOR = 30.0
+FIELD_PRIOR_PX = 2.0  # sigma of the field's coefficients
+FAR_SIGMA = 1e6  # residual of a centroid that a trial puts behind the lens
+MAX_STEPS, MAX_DAMPINGS = 60, 12
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
+MIN_GAIN = 0.02  # a step that lowers the loss by less, in half squares of a sigma, is the last
+DIFFERENCE = 1e-5  # step of a parameter's number for its numerical derivative
+FOLDS = 5
+FIELD_DEGREES = (3, 4, 5, 6, 7)
+# A larger model is taken where it brings the held-out error below this share of the smaller one's,
+# and beyond chance by so many sigmas: of eight models of 50 dots, one is 2 % better than another by
+# chance.
+GAIN, GAIN_SIGMAS = 0.98, 2.5
+CENTROIDS_PER_NUMBER = 3.0
+MAP_PLACES = (17, 11)
+FIELD_PLACES = 17  # along each side of the tracker's field
+MODE_SHARE = 1e-6  # a share of the variance over the screen: less is in no interval's digits
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,19 +156,6 @@ def directions_in_cam(
     rays = np.stack([u, v, np.ones_like(u)], axis=-1)
     back = np.stack([to_matrix(conjugate(q)) for q in geometry.q_poses])
     return np.asarray(np.einsum("nij,nj->ni", back[pose], rays))
-
-
-HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
-PRIOR = 0.3  # weight on a parameter's number: so weak that it decides only what the data leave open
-# Weight on the tracker's radial terms, which the collimator's can replace. Free, they follow what
-# neither lens can follow. How well they are known is a matter of PRIOR all the same.
-ROUND_PRIOR = 30.0
-FIELD_PRIOR_PX = 2.0  # sigma of the field's coefficients
-FAR_SIGMA = 1e6  # residual of a centroid that a trial puts behind the lens
-MAX_STEPS, MAX_DAMPINGS = 60, 12
-FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
-MIN_GAIN = 0.02  # a step that lowers the loss by less, in half squares of a sigma, is the last
-DIFFERENCE = 1e-5  # step of a parameter's number for its numerical derivative
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,15 +389,6 @@ def noise_of_repeats(data: MatchedDots) -> float | None:
     return float(MAD_TO_SIGMA * np.median(np.abs(np.concatenate(deviations))))
 
 
-FOLDS = 5
-FIELD_DEGREES = (3, 4, 5, 6, 7)
-# A larger model is taken where it brings the held-out error below this share of the smaller one's,
-# and beyond chance by so many sigmas: of eight models of 50 dots, one is 2 % better than another by
-# chance.
-GAIN, GAIN_SIGMAS = 0.98, 2.5
-CENTROIDS_PER_NUMBER = 3.0
-
-
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """A model, its name, and its error on dots that were held out of its fit.
@@ -491,11 +490,6 @@ def _is_beyond_chance(smaller: Candidate, larger: Candidate) -> bool:
     gain = np.clip(gain, -limit, limit)
     chance = float(gain.std()) / math.sqrt(len(gain))
     return float(gain.mean()) > GAIN_SIGMAS * chance
-
-
-MAP_PLACES = (17, 11)
-FIELD_PLACES = 17  # along each side of the tracker's field
-MODE_SHARE = 1e-6  # a share of the variance over the screen: less is in no interval's digits
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,40 @@ TRIALS = 600  # samples of four dots each
 MIDDLE = np.stack([np.linspace(0.8, 0.2, 4), np.linspace(0.2, 0.8, 4)])
 INLIER_SHARE = 0.03  # relative to the extent of the dots: a lens may bend a homography by this
 MIN_DECODED = 6
+FIRST_REACH = 0.03  # relative to the extent of the dots; the first map knows no lens
+# a turn that the fit finds by itself: beyond 45 deg another way round is nearer, within noise
+MAX_TURN_DEG = 60.0
+MIN_MOTION_PX = 0.05  # tracker px
+POLISH_ROUNDS = 10
+# sigmas of a frame's mean: the largest of some 30 differences of medians, with room
+MAX_CHANCE = 12.0
+MOTION_NOISE = 3.0  # times a centroid's noise: less does not matter, since every frame has many
+ORIENTATIONS = {
+    (1, 0, 0, 1): None,
+    (-1, 0, 0, 1): "mirrored left to right: set [monitor] flip_x the other way",
+    (1, 0, 0, -1): "mirrored top to bottom: set [monitor] flip_y the other way",
+    (-1, 0, 0, -1): "upside down: add 180 to [monitor] rotate_deg",
+    (0, 1, -1, 0): "turned by 90 degrees: add 270 to [monitor] rotate_deg, or turn the tracker",
+    (0, -1, 1, 0): "turned by 270 degrees: add 90 to [monitor] rotate_deg, or turn the tracker",
+    (
+        0,
+        1,
+        1,
+        0,
+    ): "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way",
+    (
+        0,
+        -1,
+        -1,
+        0,
+    ): "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way",
+}
+ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
+    "in reverse order": lambda frame, frames: frames - 1 - frame,
+    "numbered from 1": lambda frame, frames: frame - 1,
+    "one frame late": lambda frame, frames: (frame - 1) % frames,
+    "one frame early": lambda frame, frames: (frame + 1) % frames,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,42 +162,6 @@ def mapped(matrix: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray
     x, y, w = matrix @ np.stack([u, v, np.ones_like(u)])
     with np.errstate(divide="ignore", invalid="ignore"):
         return x / w, y / w
-
-
-FIRST_REACH = 0.03  # relative to the extent of the dots; the first map knows no lens
-# a turn that the fit finds by itself: beyond 45 deg another way round is nearer, within noise
-MAX_TURN_DEG = 60.0
-MIN_MOTION_PX = 0.05  # tracker px
-POLISH_ROUNDS = 10
-# sigmas of a frame's mean: the largest of some 30 differences of medians, with room
-MAX_CHANCE = 12.0
-MOTION_NOISE = 3.0  # times a centroid's noise: less does not matter, since every frame has many
-ORIENTATIONS = {
-    (1, 0, 0, 1): None,
-    (-1, 0, 0, 1): "mirrored left to right: set [monitor] flip_x the other way",
-    (1, 0, 0, -1): "mirrored top to bottom: set [monitor] flip_y the other way",
-    (-1, 0, 0, -1): "upside down: add 180 to [monitor] rotate_deg",
-    (0, 1, -1, 0): "turned by 90 degrees: add 270 to [monitor] rotate_deg, or turn the tracker",
-    (0, -1, 1, 0): "turned by 270 degrees: add 90 to [monitor] rotate_deg, or turn the tracker",
-    (
-        0,
-        1,
-        1,
-        0,
-    ): "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way",
-    (
-        0,
-        -1,
-        -1,
-        0,
-    ): "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way",
-}
-ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
-    "in reverse order": lambda frame, frames: frames - 1 - frame,
-    "numbered from 1": lambda frame, frames: frame - 1,
-    "one frame late": lambda frame, frames: (frame - 1) % frames,
-    "one frame early": lambda frame, frames: (frame + 1) % frames,
-}
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,20 @@ MAX_ROWS = 1_000_000
 NEEDED = ("frame", "x_px", "y_px")
 COLUMNS = ("frame", "pose", "x_px", "y_px", "sigma_px")  # of `Observed`
 ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, sigma_px and pose"
+FITS_ENDINGS = (".fits", ".fit", ".fts")
+MAX_IMAGE_BYTES = 500_000_000
+# share of pixels at the image's largest possible value: a few hot pixels do not matter
+SATURATED_SHARE = 1e-5
+FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
+THRESHOLD_SIGMA = 8.0
+# A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter
+# by 0.4 px in one of 1.5 px.
+MIN_WINDOW_SIGMA_PX = 1.5
+IMAGE_ADVICE = (
+    "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
+)
+NUMBER = re.compile(r"(\d+)(?!.*\d)")
+POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,22 +93,6 @@ def read_observed(path: Path) -> Observed:
         raise InputError(f"{path}: has no centroid; {ADVICE}")
     frame, x_px, y_px, sigma_px, pose = np.array(rows).T
     return Observed(frame.astype(np.intp), pose.astype(np.intp), x_px, y_px, sigma_px)
-
-
-FITS_ENDINGS = (".fits", ".fit", ".fts")
-MAX_IMAGE_BYTES = 500_000_000
-# share of pixels at the image's largest possible value: a few hot pixels do not matter
-SATURATED_SHARE = 1e-5
-FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
-THRESHOLD_SIGMA = 8.0
-# A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter
-# by 0.4 px in one of 1.5 px.
-MIN_WINDOW_SIGMA_PX = 1.5
-IMAGE_ADVICE = (
-    "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
-)
-NUMBER = re.compile(r"(\d+)(?!.*\d)")
-POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
 
 
 def measure_images(

@@ -56,6 +56,17 @@ ROUNDING_PX = 1e-12
 SAMPLE_MS = 50
 FRAME_HZ = 60
 PREDICTIONS = 60
+RATE_DEG_S = (0.7, -0.7, 5.0)
+EVENLY = (4, 8, 16, 32, 64)
+GAUSS = (8, 16, 24, 32)
+# 200 nodes on 28 sigmas at most: six times as many as the module's rule asks for.
+EXACT_NODES = 200
+# Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21
+# sigma on either side.
+WIDE_PX = 24
+STARS_ACROSS = 16
+# float32 fluxes and fractions of the sprites: 6e-8 of each.
+ROUNDING_SHARE = 1e-7
 
 
 @cache
@@ -269,17 +280,6 @@ CAMERA = monitor_camera(
     TRACKER.resolution_px, TRACKER.pixel_pitch_um, TRACKER.focal_length_mm, np.array([1.0, 0, 0, 0])
 )
 SIZE_PX = CAMERA.resolution_px[0]
-RATE_DEG_S = (0.7, -0.7, 5.0)
-EVENLY = (4, 8, 16, 32, 64)
-GAUSS = (8, 16, 24, 32)
-# 200 nodes on 28 sigmas at most: six times as many as the module's rule asks for.
-EXACT_NODES = 200
-# Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21
-# sigma on either side.
-WIDE_PX = 24
-STARS_ACROSS = 16
-# float32 fluxes and fractions of the sprites: 6e-8 of each.
-ROUNDING_SHARE = 1e-7
 
 
 SpritesOf = Callable[[Stars], FrameLight]

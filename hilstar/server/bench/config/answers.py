@@ -22,6 +22,20 @@ PLACE_FORM = 'write "HOST:PORT", such as "127.0.0.1:7000"'
 TYPES = "u8, i8, u16 to u64, i16 to i64, u24, i24, f32 or f64"
 HexBytes = Annotated[str, Meta(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$")]
 Byte = Annotated[int, Meta(ge=-MAX_FRAME_BYTES, le=MAX_FRAME_BYTES)]
+ROADS = {
+    "port": ("serial", "udp"),
+    "endpoint": ("zmq", "udp"),
+    "bind": ("zmq", "udp"),
+    "connect": ("tcp", "udp"),
+    "listen": ("tcp",),
+    "path": ("file",),
+    "allow": ("udp", "tcp"),
+    "curve_secret_key": ("zmq",),
+    "curve_server_key": ("zmq",),
+    "allowed_clients": ("zmq",),
+    "poll_hex": ("serial", "udp", "tcp"),
+}
+OF_FRAMES = ("framing", "sync_hex", "length", "match", "fields", "checksum_at")
 
 
 class FrameField(Table, frozen=True):
@@ -178,20 +192,6 @@ def host_and_port(text: str) -> tuple[str, int]:
     return match[1] or match[2], int(match[3])
 
 
-ROADS = {
-    "port": ("serial", "udp"),
-    "endpoint": ("zmq", "udp"),
-    "bind": ("zmq", "udp"),
-    "connect": ("tcp", "udp"),
-    "listen": ("tcp",),
-    "path": ("file",),
-    "allow": ("udp", "tcp"),
-    "curve_secret_key": ("zmq",),
-    "curve_server_key": ("zmq",),
-    "allowed_clients": ("zmq",),
-    "poll_hex": ("serial", "udp", "tcp"),
-}
-OF_FRAMES = ("framing", "sync_hex", "length", "match", "fields", "checksum_at")
 Faults = Iterator[tuple[bool, str]]  # what is wrong, and what is said of it
 
 

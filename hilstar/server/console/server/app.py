@@ -59,6 +59,18 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:;"
     " connect-src 'self'{sockets}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+}
+MAX_BODY_BYTES = 4_000
+# a body that is too long is read this far, so that its sender comes to read why
+MAX_DRAINED_BYTES = 64_000_000
+BODY_S = 5.0
+STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
+ORDERED_S = 30.0  # a ledger on a slow disk
 
 
 class Refused(Exception):
@@ -323,18 +335,6 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
 
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
-TYPES = {
-    ".html": "text/html",
-    ".js": "text/javascript",
-    ".css": "text/css",
-    ".svg": "image/svg+xml",
-}
-MAX_BODY_BYTES = 4_000
-# a body that is too long is read this far, so that its sender comes to read why
-MAX_DRAINED_BYTES = 64_000_000
-BODY_S = 5.0
-STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
-ORDERED_S = 30.0  # a ledger on a slow disk
 
 Give = Callable[[Order], Awaitable[OrderAnswer]]
 

@@ -28,6 +28,13 @@ MAX_PONGS_BYTES = 200_000  # that wait for a peer that sends pings and reads not
 LINE = "hilstar.line"  # in a WebSocket's scope: its `ReadingWebSocket`
 
 _connections: "OrderedDict[BoundedHttp, None]" = OrderedDict()
+MAX_CLIENTS = 32
+MAX_WAITING_TEXTS = 100  # ten seconds
+SEND_S = 10.0
+CLOSING_S = 5.0  # for a close to be read
+MAX_WISHES = 40  # in WISHES_S
+WISHES_S = 2.0
+TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
 
 
 class BoundedHttp(H11Protocol):
@@ -141,15 +148,6 @@ class ReadingWebSocket(WSProtocol):
     def drop(self) -> None:
         """Close the connection now, whatever waits to be sent."""
         self.transport.abort()
-
-
-MAX_CLIENTS = 32
-MAX_WAITING_TEXTS = 100  # ten seconds
-SEND_S = 10.0
-CLOSING_S = 5.0  # for a close to be read
-MAX_WISHES = 40  # in WISHES_S
-WISHES_S = 2.0
-TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
 
 
 class OpenPage:

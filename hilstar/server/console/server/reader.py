@@ -22,17 +22,20 @@ from hilstar.server.answers.judge import TrackerFigures
 from hilstar.server.console import messages, protocol
 from hilstar.server.console.overlay import MAX_STARS, OverlayScene
 
-
-def utc_text(unix_s: float) -> str:
-    """ "2026-11-22T19:00:00.123Z"."""
-    return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
-
-
 SILENT_NS = 6 * NS_PER_S // 10  # the run is seen ten times a second
 HUNG_NS = 4 * NS_PER_S // 10
 HUNG_PERIODS = 2.5
 UNASKED_NS = 2 * NS_PER_S  # in lockstep, without a request
 MANY_MISSED_SHARE = 0.5  # share of the last second's frames
+TICK_S = 0.1
+PACING_EACH_S = 1.0
+MIN_INTERVALS = 10
+LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
+
+
+def utc_text(unix_s: float) -> str:
+    """ "2026-11-22T19:00:00.123Z"."""
+    return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,11 +132,6 @@ class Health:
         if (not found) != self.ok:
             self.ok, self.since_s = not found, unix_s
         self.reasons = found
-
-
-TICK_S = 0.1
-PACING_EACH_S = 1.0
-MIN_INTERVALS = 10
 
 
 class RunReader:
@@ -267,9 +265,6 @@ class RunReader:
         return protocol.PageState(
             utc=now, health=health, source=self.setup.source, pacing=self.pacing, **same
         )
-
-
-LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ a last line that was cut off, each with a notice.
 
 import contextlib
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from decimal import Decimal
@@ -54,6 +55,11 @@ MARKS = frozenset(
         "fix",
         "tracking",
     ],
+)
+# Names that other programs give to angular rates. Whose axes and sign they have is not known, so
+# they are not taken for hilstar's; nor are they passed over without a word.
+RATES_OF_OTHERS = re.compile(
+    r"(?:w|om|omega|rate|gyro|gyr|ang_?vel|angular_velocity|body_rate)_?[xyz]|[xyz]_?rate|[pqr]"
 )
 MORE_ADVICE = ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
 UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"
@@ -103,6 +109,8 @@ class CsvLog:
         self.time_unit = TIME_UNITS.get(self._t.factor or Decimal(1), "s")
         self.told += [(TABLE_KIND, notice) for notice in table.notices]
         self._tell_marks()
+        if not has_rates:
+            self._tell_rates()
         if has_rates or self._sequence or self._discontinuity:
             table.advice += MORE_ADVICE
 
@@ -125,6 +133,22 @@ class CsvLog:
             named = ", ".join(marks)
             rows = f"column {named} is not used: rows of every value of it are shown"
             self.told.append((TABLE_KIND, f"{rows}; name it valid, 1 or 0"))
+
+    def _tell_rates(self) -> None:
+        headers = [
+            column.header
+            for column in self.table.columns
+            if RATES_OF_OTHERS.fullmatch(plain_name(column.name))
+        ]
+        if len(headers) >= len(RATE_COLUMNS):
+            named = ", ".join(headers)
+            self.told.append(
+                (
+                    TABLE_KIND,
+                    f"columns {named} are not used: rates are named {','.join(RATE_COLUMNS)}, of"
+                    " cam with respect to icrs in cam axes, rad/s or the unit in their names",
+                )
+            )
 
     def entries(self) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
         """Each attitude, or why it is refused, with its place in the file (":12"), in its order."""
@@ -165,6 +189,9 @@ class CsvLog:
             return self._sample(cells)
         except (ValueError, LookupError, ArithmeticError):
             pass
+        if not any(cells[column.place].strip() for column in self._q):
+            # An estimator that has not begun writes nothing, as another writes NaN.
+            return self._event(self._without_quaternion(cells))
         row = self.table.delimiter.join(cells)
         if not row.isascii():  # a minus or a blank of typesetters
             try:
@@ -175,6 +202,12 @@ class CsvLog:
         fault = next(filter(None, faults), "")
         quoted = row.strip()[:MAX_QUOTED_CHARACTERS]
         return Refusal("format", f"{quoted!r}{fault}; {self.table.advice}")
+
+    def _without_quaternion(self, cells: list[str]) -> list[str]:
+        cells = cells.copy()
+        for column in self._q:
+            cells[column.place] = "nan"
+        return cells
 
     def _sample(self, cells: list[str]) -> AttitudeSample | Refusal:
         """The attitude of a row, as sent. Raises ValueError, LookupError or ArithmeticError."""

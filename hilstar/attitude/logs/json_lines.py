@@ -42,6 +42,7 @@ TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[{}"]')
 BETWEEN = re.compile(r"[\s,\[\]]*")
 MAX_OBJECT_CHARACTERS = 10_000
 ADVICE = f"write JSON lines, or an array, of objects {JSON_FORM}"
+CUT_OBJECT = "the last object has no end, as of a file that was cut off, and is left out"
 NO_END = "the array has no ] at its end, as of a file that was cut off; what it has is read"
 
 
@@ -76,15 +77,20 @@ def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterato
         yield LogEntry(where, event)
     if invalid:
         told.append(invalid_notice(invalid, "line"))
-    if objects.depth > 0:
+    if objects.is_cut:
+        told.append((CUT_KIND, CUT_OBJECT))
+    elif objects.depth > 0:
         told.append((CUT_KIND, NO_END))
 
 
 class JsonObjects:
-    """Splits JSON into the texts of its objects; `depth` is that of the arrays around them."""
+    """Splits JSON into the texts of its objects; `depth` is that of the arrays around them, and
+    `is_cut` whether the file ended within the last object, which is left out.
+    """
 
     def __init__(self) -> None:
         self.depth = 0
+        self.is_cut = False
         self._count = 0
         # The line of what is read, and the one on which what waits began.
         self._line = 1
@@ -106,8 +112,18 @@ class JsonObjects:
             self._line += ends_line
             if not waiting:
                 self._first_line = self._line
-        if waiting:
+        if self._is_cut_off(waiting):
+            self.is_cut = True
+        elif waiting:
             yield self._where(), waiting.strip()
+
+    def _is_cut_off(self, waiting: str) -> bool:
+        """Whether what is left is one object that a cut file ends in. One without an end between
+        others has their brackets, too, and is refused.
+        """
+        is_begun = self._count > 0 and waiting.startswith("{")
+        is_short = len(waiting) <= MAX_OBJECT_CHARACTERS
+        return is_begun and is_short and waiting.count("{") == 1
 
     def _next_object(self, text: str, place: int) -> int:
         """The place of what follows the commas, blanks and brackets from a place on."""

@@ -101,7 +101,7 @@ def test_stars_are_found_on_a_screen_that_glows_over_a_part_of_the_field(tmp_pat
             live.take(frame_of(bench, number))
         exposed = live.frames.exposed(0, FRAMES * PERIOD_NS)
         assert exposed is not None
-        solved = live.solve(exposed)
+        solved = live.solve(exposed, live.expose(exposed))
         glow_dn = float(np.ptp(live._under_e)) / file.config.tracker.detector.gain_e_per_dn
     assert glow_dn > 10
     assert solved.mode == TRACKING

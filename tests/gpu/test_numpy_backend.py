@@ -41,7 +41,9 @@ OTHER = {
 # How much the errors of blocks of light may differ. With `effort` OpenGL cuts the wings of all
 # stars within the tolerance, by some levels next to a star over white; NumPy's `exact` has them
 # whole, as where OpenGL lacks compute shaders.
-ERRORS, CUT_ERRORS = 0.12, 0.4
+# OpenGL's `exact` makes up for what the dark wings of a path take (0.0017 mag of a star of one turn
+# of 1 deg/s at 12 bits), NumPy's does not: trails' blocks differ by it, their levels hardly.
+ERRORS, CUT_ERRORS, PATH_ERRORS = 0.12, 0.4, 0.2
 
 
 def opened(name: str, folder) -> hilstar.Bench:
@@ -106,7 +108,8 @@ def test_stars_have_the_same_light_and_levels(name, tmp_path):
         )
     assert lit > 1000 and other <= OTHER[name] * lit
     gl_error, error = np.sqrt(np.sum(errors, axis=0))
-    assert error == pytest.approx(gl_error, rel=CUT_ERRORS if name == "effort" else ERRORS)
+    bounds = {"effort": CUT_ERRORS, "satellites": PATH_ERRORS}
+    assert error == pytest.approx(gl_error, rel=bounds.get(name, ERRORS))
 
 
 def test_discs_have_the_light_of_opengl_within_its_own_error(tmp_path):

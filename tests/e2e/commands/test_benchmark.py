@@ -56,6 +56,12 @@ def measured(tmp_path_factory):
     return json.loads(result.stdout), folder
 
 
+def drawn_stages(result) -> set[str]:
+    """The stages of the way that draws here: a processor uploads nothing."""
+    kinds = {row["kind"] for row in result["rows"]}
+    return set(STAGES) if "upload" in kinds else set(STAGES) - {"upload"}
+
+
 def test_rows_are_those_of_the_contract(measured):
     result, _ = measured
     assert result["machine"]["cores"] >= 1
@@ -70,7 +76,7 @@ def test_rows_are_those_of_the_contract(measured):
             if row["stars"] == count and row["method"] == "hilstar"
         ]
         assert kinds.count("whole_frame") == kinds.count("turning") == 1
-        assert set(STAGES) < set(kinds)
+        assert drawn_stages(result) < set(kinds)
         assert [
             row["kind"]
             for row in result["rows"]
@@ -107,7 +113,7 @@ def test_stages_make_up_the_whole_frame(measured):
             for row in result["rows"]
             if row["stars"] == count and row["method"] == "hilstar"
         }
-        total = sum(ms[stage] for stage in STAGES)
+        total = sum(ms[stage] for stage in drawn_stages(result))
         assert 1 / SUM_FACTOR < total / ms["whole_frame"] < SUM_FACTOR
 
 

@@ -266,8 +266,8 @@ def test_what_would_do_is_asked_of_frame_and_no_file_is_changed(tmp_path, option
 
 def test_frame_explains_a_bench_without_a_file_to_write(tmp_path):
     path = tmp_path / "bench.toml"
-    coarse = {"monitor": {"bits": 8}, "render": {"quantisation": "round"}}
-    path.write_text(bench_text(TWIN, coarse))
+    coarse = {"quantisation": "round", "tolerance_mag": 0.01, "tolerance_px": 0.01}
+    path.write_text(bench_text(TWIN, {"monitor": {"bits": 8}, "render": coarse}))
     done = run_hilstar_here("frame", path, "--radec", "84,-1,0", "--explain", "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

@@ -313,7 +313,7 @@ def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
             axes.axhline(1.0, color=RED, linewidth=1, label=name)
             axes.grid(visible=False, axis="x")
             axes.set_ylim(0, 1.45 * max(1.0, *(bar.get_height() for bar in axes.patches)))  # type: ignore[attr-defined]
-        speed.set_ylabel("full / auto time")
+        speed.set_ylabel("full / auto, time")
         error.set_ylabel("error / limit")
         # Shares of 0.25 would push the label off the canvas.
         error.set_yticks(np.arange(0.0, error.get_ylim()[1], 0.5))

@@ -27,6 +27,7 @@ from hilstar.instruments.study.trials import (
     Trials,
     draw_trials,
     measured,
+    ms_words,
     table_lines,
 )
 from hilstar.optics.psf import MAX_CUT
@@ -290,3 +291,9 @@ def test_every_step_is_known_and_a_chart_that_cannot_be_written_is_refused(tmp_p
     assert len(STEPS) == len(NAMES)
     with pytest.raises(InputError, match="cannot be written"):
         draw_trials(tmp_path / "no" / "chart.png", measured(planted(clock, 4.0), 0.01), "here")
+
+
+def test_a_title_says_a_time_as_it_is_drawn():
+    """1196 ms were told as 1200 ms, beside a point that is drawn at 1196."""
+    said = [ms_words(ms) for ms in (0.4567, 22.44, 999.4, 999.6, 1196.4)]
+    assert said == ["0.457 ms", "22.4 ms", "999 ms", "1000 ms", "1196 ms"]

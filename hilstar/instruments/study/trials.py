@@ -39,6 +39,7 @@ LABEL_COLUMNS = 40  # characters along an axis as high as a panel
 MARKS = {True: "*>", False: "  "}
 SHARE = "1"  # the unit of what has none
 TITLES = {"psf": "PSF"}  # of a step whose name is an abbreviation
+WHOLE_FROM_MS = 999.5  # .3g would say 1.2e+03, and round away what is drawn
 MIN_HEIGHT_INCH, HEAD_INCH, NAME_INCH = 4.2, 1.9, 0.17
 
 
@@ -172,10 +173,17 @@ def finding(step: Trials) -> str:
     if default.error <= step.error.floor:
         off = "has no error"
     text = f"{TITLES.get(step.name, step.name)}: '{default.method}' {off}"
-    timed = f"{text} in {default.time_ms:.3g} ms"
+    timed = f"{text} in {ms_words(default.time_ms)}"
     if exact is not None:
-        timed += f"; '{exact.method}' takes {exact.time_ms:.3g} ms"
+        timed += f"; '{exact.method}' takes {ms_words(exact.time_ms)}"
     return step.load.title(timed, text)
+
+
+def ms_words(time_ms: float) -> str:
+    """A time as a title says it: three digits, and all whole milliseconds from a second on."""
+    if time_ms < WHOLE_FROM_MS:
+        return f"{time_ms:.3g} ms"
+    return f"{time_ms:.0f} ms"
 
 
 def said(value: float, figure: Figure) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.charts import BLUE, GREEN, MUTED, chart, write_records
+from hilstar.basics.charts import BLUE, GREEN, chart, write_records
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from hilstar.basics.units import NS_PER_S, magnitude
 from hilstar.display.quantise import shown_light
@@ -17,10 +17,13 @@ from hilstar.instruments.study.row_charts import (
     ChartSpec,
     LevelLine,
     LineSpec,
+    PairSpec,
     PanelSpec,
     SeriesLook,
+    draw_pairs,
     draw_rows,
     finite,
+    name_places,
 )
 from hilstar.instruments.study.settings import FULL_HD, Isolation, Table, lone_windows, study_bench
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
@@ -298,22 +301,8 @@ def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:
     ) as panels:
         for (name, colour), axes in zip(COLOURS.items(), panels, strict=True):
             mine = [cost for cost in costs if cost.quantisation == name]
-            for place, cost in enumerate(mine):
-                axes.plot([cost.without_ms, cost.frame_ms], [place, place], color=MUTED, lw=1)
-            places = range(len(mine))
-            axes.plot(
-                [cost.without_ms for cost in mine],
-                places,
-                "o",
-                color=colour,
-                mfc="none",
-                label="without",
-            )
-            axes.plot(
-                [cost.frame_ms for cost in mine], places, "o", color=colour, label="with the fault"
-            )
-            axes.set(xscale="log", xlabel="time of a frame [ms]")
+            looks = SeriesLook("without", colour), SeriesLook("with the fault", colour)
+            draw_pairs(axes, PairSpec("without_ms", "frame_ms", looks, open_first=True), mine)
+            axes.set_xlabel("time of a frame [ms]")
             axes.set_title(name, color=colour)
-            axes.grid(visible=False, axis="y")
-        panels[0].set_yticks(range(len(CASES)), list(CASES))
-        panels[0].invert_yaxis()
+        name_places(panels[0], list(CASES))

@@ -3,7 +3,9 @@ time.
 """
 
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,6 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import (
     BLUE,
     INK,
-    MUTED,
     ORANGE,
     SMALL_PT,
     chart,
@@ -28,12 +29,21 @@ from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.response import srgb_response
 from hilstar.instruments.study import codes
+from hilstar.instruments.study.row_charts import PairSpec, SeriesLook, draw_pairs, name_places
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 
 Found = dict[tuple[int, str], list[StarErrors]]
 MIN_ERROR = 1e-5  # as drawn
+EACH_NOTE = (
+    "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of the"
+    " error of round."
+)
+EACH_PAIRS = PairSpec(
+    "round_px", "exact_px", (SeriesLook("round", ORANGE), SeriesLook("exact", BLUE))
+)
+BESIDE: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALL_PT}
 MARKERS = dict(zip(codes.BITS, "os^", strict=True))
 
 
@@ -63,7 +73,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
     times = _frame_times_ms(3 if quick else 31)
     load = others.load()
     _draw_magnitudes(directory / "quantisation", found, mags)
-    _draw_each(directory / "quantisation_centroiders", faintest)
+    draw_each(directory / "quantisation_centroiders", centroider_errors(faintest))
     _draw_times(directory / "quantisation_time", faintest, times, load)
     write_csv(
         directory / "quantisation_time.csv",
@@ -181,47 +191,51 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
             axes.set_xlabel("magnitudes under a white peak")
 
 
-def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
-    left = {
-        (bits, kind): (
-            faintest[bits, "exact"].axis_rms_px(kind) / faintest[bits, "round"].axis_rms_px(kind)
-        )
-        for bits in codes.BITS
-        for kind in FAMILY
-    }
+@dataclass(frozen=True, slots=True)
+class CentroiderErrors:
+    """What round and exact codes do to a place by one centroider, rms along an axis, px."""
+
+    bits: int
+    centroider: str
+    round_px: float
+    exact_px: float
+
+    @property
+    def share(self) -> float:
+        """What exact leaves of the error that round makes."""
+        return self.exact_px / self.round_px
+
+
+def centroider_errors(faintest: dict[tuple[int, str], StarErrors]) -> list[CentroiderErrors]:
+    """The errors at the faint end by bits and centroider."""
+    rows = []
+    for bits, kind in product(codes.BITS, FAMILY):
+        rounded, exact = faintest[bits, "round"], faintest[bits, "exact"]
+        errors_px = rounded.axis_rms_px(kind), exact.axis_rms_px(kind)
+        rows.append(CentroiderErrors(bits, kind, *errors_px))
+    return rows
+
+
+def draw_each(path: Path, rows: list[CentroiderErrors]) -> None:
+    """The errors of round and exact by each centroider, a panel for each number of bits."""
+    shares = [row.share for row in rows]
     finding = (
-        f"Whichever centroider the tracker has, exact leaves {min(left.values()):.2f} to"
-        f" {max(left.values()):.2f} of the error that round makes at the faint end"
+        f"Whichever centroider the tracker has, exact leaves {min(shares):.2f} to"
+        f" {max(shares):.2f} of the error that round makes at the faint end"
     )
-    note = (
-        "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of"
-        " the error of round."
-    )
-    with chart(
-        path, finding, 1, len(codes.BITS), note=note, share_x=True, share_y=True, height_inch=3.6
-    ) as grid:
+    count = len(codes.BITS)
+    with chart(path, finding, 1, count, note=EACH_NOTE, share_y=True, height_inch=3.6) as grid:
         for bits, axes in zip(codes.BITS, grid, strict=True):
-            for place, kind in enumerate(FAMILY):
-                rounded, exact = (
-                    faintest[bits, name].axis_rms_px(kind) for name in ("round", "exact")
-                )
-                axes.plot([exact, rounded], [place, place], color=MUTED, lw=1)
-                axes.plot(rounded, place, "o", color=ORANGE, label="_" if place else "round")
-                axes.plot(exact, place, "o", color=BLUE, label="_" if place else "exact")
-                beside: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALL_PT}
-                axes.annotate(f"{left[bits, kind]:.2f}", (rounded, place), (6, 0), **beside)
-            axes.set(
-                xscale="log",
-                title=f"{bits} bits, {codes.AIMS[bits][1]:g} mag under white",
-                xlabel="error [monitor px]",
-            )
+            of_bits = [row for row in rows if row.bits == bits]
+            draw_pairs(axes, EACH_PAIRS, of_bits)
+            for place, row in enumerate(of_bits):
+                axes.annotate(f"{row.share:.2f}", (row.round_px, place), (6, 0), **BESIDE)
+            title = f"{bits} bits, {codes.AIMS[bits][1]:g} mag under white"
+            axes.set(title=title, xlabel="error [monitor px]")
             axes.margins(x=0.2, y=0.12)
-            axes.grid(visible=False, axis="y")
-        grid[0].set_yticks(range(len(FAMILY)), FAMILY)
-        grid[0].invert_yaxis()
-        grid[0].figure.legend(
-            *grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=2
-        )
+        name_places(grid[0], FAMILY)
+        names = grid[0].get_legend_handles_labels()
+        grid[0].figure.legend(*names, loc="outside upper right", ncols=2)
 
 
 def _draw_times(

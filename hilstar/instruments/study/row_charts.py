@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import INK, SERIES, chart, label_ends, plain_ticks, write_csv
+from hilstar.basics.charts import INK, MUTED, SERIES, chart, label_ends, plain_ticks, write_csv
 from hilstar.instruments.study.sweep import Load
 
 if TYPE_CHECKING:
@@ -119,6 +119,20 @@ class CurvePanel:
     spec: PanelSpec
     colours: tuple[str, ...] = ()
     look: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class PairSpec:
+    """Two values of each row on one line, as of a thing without and with something.
+
+    `looks` are those of the two points, of which the first is an open circle where it is
+    `open_first`.
+    """
+
+    first: str
+    second: str
+    looks: tuple[SeriesLook, SeriesLook]
+    open_first: bool = False
 
 
 def looks_of(labels: Mapping[Any, str], markers: str = "") -> dict[Any, SeriesLook]:
@@ -253,3 +267,25 @@ def finite(name: str, below: float = np.inf) -> Callable[[Any], float]:
         return size if size < below else np.nan
 
     return value
+
+
+def draw_pairs(axes: "Axes", spec: PairSpec, rows: Sequence[Any]) -> None:
+    """Draw the pairs of rows, the first row's place 0, on a logarithmic axis."""
+    places = range(len(rows))
+    first, second = values(rows, spec.first), values(rows, spec.second)
+    for place, (low, high) in enumerate(zip(first, second, strict=True)):
+        axes.plot([low, high], [place, place], color=MUTED, lw=1)
+    first_look, second_look = spec.looks
+    face: dict[str, Any] = {}
+    if spec.open_first:
+        face["mfc"] = "none"
+    axes.plot(first, places, "o", color=first_look.colour, label=first_look.label, **face)
+    axes.plot(second, places, "o", color=second_look.colour, label=second_look.label)
+    axes.set_xscale("log")
+    axes.grid(visible=False, axis="y")
+
+
+def name_places(axes: "Axes", names: Sequence[str]) -> None:
+    """The names of a panel's places, the first on top."""
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()

@@ -105,6 +105,8 @@ def replay(
         running.say_of_light(bench)
         if explain:
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))
+        # Before the run: what would do takes seconds, and a run that is stopped ends at once.
+        effort = running.effort_of_run(bench, explain, as_json)
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
         told = RunSource(
             f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen)
@@ -122,5 +124,5 @@ def replay(
         ):
             outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
             summary = replay_log(bench, play, sink, outlet)
-        summary = replaced(summary, **running.effort_of_run(bench, explain, as_json))
+        summary = replaced(summary, **effort)
     running.end_of_run(summary, screen, kept, notices, as_json, strict)

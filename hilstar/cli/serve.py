@@ -228,7 +228,9 @@ def serve(
         )
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
-        optics = running.say_seen(bench)
+        # Before the run: what would do takes seconds, and a run that is stopped ends at once.
+        effort = running.effort_of_run(bench, explain, as_json)
+        optics = running.say_seen(bench) | effort
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
         told = RunSource(
@@ -263,7 +265,6 @@ def serve(
                 answers,
             )
             summary = serve_stream(bench, link, limit, fed[0], outlet)
-        optics |= running.effort_of_run(bench, explain, as_json)
     whole_summary = replaced(summary, beat=beat, **optics)
     running.end_of_run(whole_summary, screen, kept, notices, as_json, strict)
     if not summary.packets.accepted:

@@ -438,7 +438,8 @@ def red_after_death_ms(page: Browser, shown: Sky) -> float:
 def test_when_the_run_dies_the_page_is_red(page, tmp_path):
     with sky(tmp_path) as shown, CoreWaits(page.service.process.pid) as waited:
         took_ms = red_after_death_ms(page, shown)
-    assert page.text("#health-headline") == "No word from hilstar"
+    headline = "document.getElementById('health-headline').textContent"
+    page.until(f"{headline} === 'No word from hilstar'")
     page.until("document.getElementById('control-state').textContent === 'no connection'")
     page.get("about:blank")
     page.complaints()  # that the connection was refused

@@ -18,6 +18,7 @@ import msgspec
 
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.attitude.wire.zmq_socket import SocketOptions
+from hilstar.basics.allowance import Allowance
 from hilstar.basics.errors import InputError, printable, shortened
 from hilstar.basics.notices import Notices
 from hilstar.basics.reading import NOT_JSON
@@ -30,7 +31,7 @@ from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import FILE, FaultChange, FaultSchedule, Scenario, share_on
 from hilstar.server.loop import FaultyFrames
 from hilstar.server.open_link import link_keys
-from hilstar.server.record.ledger import Allowance, LedgerSwitch
+from hilstar.server.record.ledger import LedgerSwitch
 from hilstar.server.record.ledger_records import FaultRecord, FrameRecord, fault_records
 
 STREAM = "stream"

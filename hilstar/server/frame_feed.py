@@ -111,19 +111,29 @@ class FrameFeed(Closing):
             self._free.put(copied)
 
     def _frame(self, head: FrameHead, levels: npt.NDArray[np.unsignedinteger[Any]]) -> ShownFrame:
-        if levels.ndim == 3:
-            lit = np.flatnonzero(levels.any(axis=2))
-            return ShownFrame(head, lit.astype(np.uint32), levels.reshape(-1, levels.shape[2])[lit])
-        lit = lit_pixels(levels)
-        found = levels.ravel()[lit]
-        codes = found if self._rgb is None else self._rgb[found].astype(code_dtype(head.bits))
-        return ShownFrame(head, lit.astype(np.uint32), codes)
+        lit, codes = lit_codes(levels)
+        if levels.ndim == 2 and self._rgb is not None:
+            codes = self._rgb[codes].astype(code_dtype(head.bits))
+        return ShownFrame(head, lit, codes)
 
     def close(self) -> None:
         """End the thread, then close the sender."""
         self._full.put(None)
         self._thread.join()
         self._sender.close()
+
+
+def lit_codes(
+    codes: npt.NDArray[np.unsignedinteger[Any]],
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.unsignedinteger[Any]]]:
+    """The flat indices (n,) of pixels over code 0, rising, and their codes, of an image (h, w) or
+    (h, w, 3).
+    """
+    if codes.ndim == 3:
+        lit = np.flatnonzero(codes.any(axis=2))
+        return lit.astype(np.uint32), codes.reshape(-1, codes.shape[2])[lit]
+    lit = lit_pixels(codes)
+    return lit.astype(np.uint32), codes.ravel()[lit]
 
 
 def lit_pixels(levels: npt.NDArray[np.unsignedinteger[Any]]) -> npt.NDArray[np.intp]:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import msgspec
 
+from hilstar.basics.allowance import Allowance
 from hilstar.basics.errors import one_line
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
@@ -22,7 +23,7 @@ from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged, Track
 from hilstar.server.answers.pairing import LitFrame, LitFrames
 from hilstar.server.bench.frame import Bench
 from hilstar.server.pacer import Shown
-from hilstar.server.record.ledger import Allowance, LedgerSwitch
+from hilstar.server.record.ledger import LedgerSwitch
 from hilstar.server.record.ledger_records import answer_record
 from hilstar.server.screen.screen import Screen
 

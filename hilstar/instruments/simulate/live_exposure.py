@@ -204,7 +204,9 @@ class LiveTracker(Closing):
         background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
         glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
         self._under_e = glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
-        self._bench_exposure_s, self._gain_db = self.exposure_s, 0.0
+        self._gain_db = 0.0
+        # As the bench file has them: what a client sets is worked out from these.
+        self._bench_exposure_s, self._bench_under_e = self.exposure_s, self._under_e
         self._dark_dn = self._uneven_dark_dn()
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
@@ -220,8 +222,7 @@ class LiveTracker(Closing):
         """
         detector = self._detector.settings
         full_dn = 2**detector.bits - 1
-        under_e = self._under_e * (self.exposure_s / self._bench_exposure_s)
-        dark_dn = detector.offset_dn + under_e / detector.gain_e_per_dn
+        dark_dn = detector.offset_dn + self._under_e / detector.gain_e_per_dn
         dark_dn = software_image(np.clip(dark_dn, 0.0, full_dn), detector)
         return dark_dn if np.ptp(dark_dn) > EVEN_DARK_DN else None
 
@@ -262,6 +263,7 @@ class LiveTracker(Closing):
         """Expose for `exposure_s`, with a gain over the bench file's, as a camera's client asks."""
         if (exposure_s, gain_db) == (self.exposure_s, self._gain_db):
             return
+        self._under_e = self._bench_under_e * (exposure_s / self._bench_exposure_s)
         self.exposure_s, self._gain_db = exposure_s, gain_db
         tracker = self.config.tracker
         gain_e_per_dn = tracker.detector.gain_e_per_dn / 10 ** (gain_db / 20)
@@ -274,7 +276,7 @@ class LiveTracker(Closing):
         lights = (LitLight(exposed.lit, light) for light in exposed.light_e_per_s.T)
         images = self._optics.images_e_per_s(lights, self._primaries)
         light = self._colours.shown(images) * self.exposure_s
-        light += self._under_e * (self.exposure_s / self._bench_exposure_s)
+        light += self._under_e
         return self._detector.expose(light, self.exposure_s, self._rng)
 
     def solve(self, exposed: Exposed, dn: npt.NDArray[np.uint16]) -> Solved:

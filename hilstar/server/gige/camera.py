@@ -29,6 +29,7 @@ import numpy.typing as npt
 
 from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.attitude.wire.udp import keep_only_networks
+from hilstar.basics.allowance import Allowance
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.closing import Closing
@@ -96,25 +97,6 @@ class CameraCounts:
     triggers: int = 0
 
 
-class Allowance:
-    """So many a second, and at most a second's at once."""
-
-    def __init__(self, per_s: float, clock: HostClock) -> None:
-        self._per_s, self._clock = per_s, clock
-        self._room, self._at_ns = per_s, clock.now_ns()
-
-    def take(self, count: int = 1) -> bool:
-        """Whether `count` more are within it; they are then taken."""
-        now_ns = self._clock.now_ns()
-        earned = (now_ns - self._at_ns) / NS_PER_S * self._per_s
-        self._room = min(self._per_s, self._room + earned)
-        self._at_ns = now_ns
-        if self._room < count:
-            return False
-        self._room -= count
-        return True
-
-
 def camera_address(text: str) -> ipaddress.IPv4Address:
     """The address to bind. Raises InputError for another than a numeric IPv4 address."""
     try:
@@ -158,8 +140,8 @@ class GigECamera(Closing):
         self._triggers_ns: deque[int] = deque()
         self.started_ns = 0  # the newest start, host time: no exposure of a stream began before
         self._remaining: int | None = None
-        self._others = Allowance(MAX_OTHERS_PER_S, clock)
-        self._again = Allowance(MAX_RESENT_PER_S, clock)
+        self._others = Allowance(MAX_OTHERS_PER_S, MAX_OTHERS_PER_S)
+        self._again = Allowance(MAX_RESENT_PER_S, MAX_RESENT_PER_S)
         self._filtered = False
         self._block = 0
         self._blocks: deque[ImageBlock] = deque(maxlen=KEPT_BLOCKS)
@@ -232,7 +214,7 @@ class GigECamera(Closing):
             if not self._allowed.admits(peer[0]):
                 strangers += 1
                 host = peer[0]
-            elif self.channel.is_client(peer) or self._others.take():
+            elif self.channel.is_client(peer) or self._others.take(self._clock.now_ns()):
                 self._answer(data, peer)
         if strangers:
             self._refuse(strangers, host, directed=listening is self._control_socket)
@@ -298,7 +280,8 @@ class GigECamera(Closing):
 
     def _resend(self, request: Resend) -> None:
         destination = self.channel.destination
-        if destination is None or not self._again.take(request.last - request.first + 1):
+        count = request.last - request.first + 1
+        if destination is None or not self._again.take(self._clock.now_ns(), count):
             return
         block = next((one for one in list(self._blocks) if one.number == request.block), None)
         if block is None:

@@ -340,13 +340,15 @@ class Registers:
 
     def write(self, address: int, data: bytes) -> None:
         """Write a register (4 bytes), or the user's name. Raises RegisterError."""
-        if address % WORD_BYTES or len(data) % WORD_BYTES or not data:
+        if address % WORD_BYTES:
             raise RegisterError(GvcpStatus.BAD_ALIGNMENT)
         if address == USER_NAME and len(data) <= USER_NAME_BYTES:
             self._boot[address : address + USER_NAME_BYTES] = data.ljust(USER_NAME_BYTES, b"\0")
             return
-        for offset in range(0, len(data), WORD_BYTES):
-            self._write_word(address + offset, data[offset : offset + WORD_BYTES])
+        # One at a time: of several a later one may be refused when the first is written.
+        if len(data) != WORD_BYTES:
+            raise RegisterError(GvcpStatus.INVALID_PARAMETER)
+        self._write_word(address, data)
 
     def _write_word(self, address: int, data: bytes) -> None:
         feature = BY_ADDRESS.get(address)
@@ -355,7 +357,9 @@ class Registers:
             return
         value = int.from_bytes(data, "big")
         if address == HEARTBEAT_MS:
-            self.put_word(address, max(value, MIN_HEARTBEAT_MS))
+            if value < MIN_HEARTBEAT_MS:
+                raise RegisterError(GvcpStatus.INVALID_PARAMETER)
+            self.put_word(address, value)
         elif address == TIME_CONTROL:
             # Only the reading is latched: the tracker's clock is not a client's to set back.
             if value & RESET or not value & LATCH:

@@ -37,12 +37,12 @@ from hilstar.attitude.logs.mcap_log import (
     refused_message,
 )
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.basics.allowance import Allowance
 from hilstar.basics.errors import InputError, cannot_write, printable
 from hilstar.basics.files import NewFile
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import caught, stop_on_signal
-from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import BEGINS, ENDS
 from hilstar.server.bench.certificate import certificate_number
 from hilstar.server.bench.frame import Bench
@@ -131,24 +131,6 @@ class LedgerQueue:
 
 
 Counted = Kind | Literal["pulse", "lost"]  # pulses and lost packets are only counted
-
-
-class Allowance:
-    """A token bucket: `burst` messages at once, then `per_s` each second, are recorded in full."""
-
-    def __init__(self, burst: float, per_s: float) -> None:
-        self._burst, self._per_s = burst, per_s
-        self._left, self._last_ns = burst, 0
-
-    def take(self, now_ns: int) -> bool:
-        """Whether one more message is recorded in full."""
-        passed_s = max(0, now_ns - self._last_ns) / NS_PER_S if self._last_ns else 0.0
-        self._last_ns = now_ns
-        self._left = min(self._burst, self._left + passed_s * self._per_s)
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
 
 
 class FloodFilter:

@@ -50,6 +50,7 @@ from hilstar.server.bench.build import calibration_source, open_bench, orientati
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.frame_files import png_of, write_codes_png
 from hilstar.server.bench.measured_on import check_monitor
+from hilstar.server.frame_feed import lit_codes
 from hilstar.server.genicam.camera import PREFIX, CameraError, GenicamCamera, chosen_format
 from hilstar.server.screen.gate import Timing, pass_gate
 from hilstar.server.screen.screen import Screen, marker_light
@@ -276,9 +277,7 @@ class PatternFrames:
         if not self._sender.look():
             return
         height, width = codes.shape[:2]
-        channels = 3 if codes.ndim == 3 else 1
-        flat = codes.reshape(height * width, channels)
-        lit = np.flatnonzero(flat.any(axis=1))
+        lit, values = lit_codes(codes)
         self._number += 1
         head = FrameHead(
             frame=self._number,
@@ -286,11 +285,10 @@ class PatternFrames:
             width=width,
             height=height,
             bits=file.config.monitor.bits,
-            channels=channels,
+            channels=3 if codes.ndim == 3 else 1,
             bench_sha256=file.sha256,
         )
-        lit_codes = flat[lit] if channels == 3 else flat[lit, 0]
-        self._sender.put_frame(ShownFrame(head, lit.astype(np.uint32), lit_codes))
+        self._sender.put_frame(ShownFrame(head, lit, values))
 
 
 class PatternDisplay(Closing):

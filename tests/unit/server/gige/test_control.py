@@ -190,6 +190,17 @@ def test_a_longer_exposure_lowers_the_rate_and_a_rate_beyond_it_is_refused():
     assert client.write(ADDRESSES["AcquisitionFrameRate"], _word(1.5)) == 0
 
 
+def test_a_refused_write_changes_nothing_and_no_heartbeat_is_rounded():
+    camera = channel()
+    client = Asker(camera)
+    client.write(PRIVILEGE, CONTROL)
+    several = struct.pack(">IIII", STREAM_PORT, 5123, 2000, 7)  # port, packet size and delay
+    assert client.ask(0x0086, several)[0] == GvcpStatus.INVALID_PARAMETER
+    assert camera.destination is None and camera.packet_bytes == 1500
+    assert client.write(0x0938, 10) == GvcpStatus.INVALID_PARAMETER
+    assert client.read(0x0938) == 3000
+
+
 def test_the_pixel_format_holds_while_images_flow():
     camera = channel()
     client = Asker(camera)

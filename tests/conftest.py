@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 # A worker fills its core: threads of BLAS that wait for another make small products slow. Before
@@ -24,9 +24,11 @@ gc.disable()
 
 import numpy as np
 import pytest
+from xdist.workermanage import WorkerController
 
 import hilstar
-from tests.support import leftovers
+from hilstar.instruments.study.sweep import OtherWork
+from tests.support import leftovers, selection
 from tests.support.benches import SMALL_BENCH
 
 # A shell ignores SIGINT for what it runs with `&`, and what ignores it hands that on: a test's
@@ -44,23 +46,53 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-# Functions whose tests together took over 0.3 s of CPU when all were measured (`--durations=0`);
-# one a line.
-SLOW = frozenset((Path(__file__).parent / "slow.txt").read_text().split())
 MARKERS = {"study": "study", "gpu": "gpu", "screen": "screen", "e2e": "e2e", "examples": "e2e"}
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what lies in a folder, and what is slow; a test elsewhere that starts processes, or
-    runs a study, marks itself.
-    """
+def pytest_addoption(parser: pytest.Parser) -> None:
+    selection.add_options(parser)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what lies in a folder, and leave out what the command does not ask for."""
     here = Path(__file__).parent
     for item in items:
         folder = item.path.relative_to(here).parts[0]
         if folder in MARKERS:
             item.add_marker(MARKERS[folder])
-        if item.nodeid.partition("[")[0] in SLOW:
+        if folder == "timing":
+            item.add_marker("timing")
+        if item.nodeid.partition("[")[0] in selection.SLOW:
             item.add_marker("slow")
+    selection.select(config, items)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Beside a claim of time stands what else the machine did meanwhile."""
+    if item.get_closest_marker("timing") is None:
+        return (yield)
+    other_work = OtherWork()
+    try:
+        return (yield)
+    finally:
+        item.user_properties.append(("other_cores", other_work.cores()))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    selection.hand_on(session)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: WorkerController) -> None:
+    node.workerinput["is_bare"] = selection.is_bare(node.config)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: WorkerController) -> None:
+    """Every worker has collected the same: one's counts are all."""
+    output = getattr(node, "workeroutput", {})
+    node.config.stash[selection.LEFT_OUT] = output.get("left_out", {})
 
 
 def pytest_collection_finish() -> None:
@@ -75,7 +107,11 @@ def pytest_collection_finish() -> None:
 def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> None:
-    """With --durations, the seconds of each folder too: where a suite's time is."""
+    """What was left out; with --durations, the seconds of each folder too: where a suite's time
+    is.
+    """
+    selection.report(terminalreporter, config)
+    report_other_work(terminalreporter)
     if config.getoption("durations") is None:
         return
     seconds: Counter[str] = Counter()
@@ -88,6 +124,20 @@ def pytest_terminal_summary(
     terminalreporter.section("seconds by folder, summed over workers")
     for folder, duration in seconds.most_common(20):
         terminalreporter.write_line(f"{duration:8.1f} s  {folder}")
+
+
+def report_other_work(reporter: pytest.TerminalReporter) -> None:
+    """For each test that claims a time: how long it took, and the cores that others had."""
+    rows: list[tuple[str, float, float]] = []
+    for outcome in ("passed", "failed"):
+        for report in reporter.stats.get(outcome, []):
+            cores = dict(report.user_properties).get("other_cores")
+            if report.when == "call" and cores is not None:
+                rows.append((report.nodeid, report.duration, cores))
+    if rows:
+        reporter.section(f"claims of time; cores that other work took of {os.cpu_count()}")
+    for nodeid, duration_s, cores in rows:
+        reporter.write_line(f"{duration_s:8.1f} s {cores:5.1f} cores  {nodeid}")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -128,6 +128,7 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
     assert "flip_y = true" in bench.read_text()
 
 
+@pytest.mark.timing
 @best_of_three("the diode is a thread of this process: while it has no core, it sees a light late")
 def test_the_delay_of_a_real_display_is_found_by_a_photodiode(screen, tmp_path):
     """The command that takes images fails, so only what needs none is measured: what is added to

@@ -302,6 +302,7 @@ def red_after_stale_ms(page: Browser, run: Sky) -> float:
     return page.run("return window.redAt") - (since_ms + now_ms)
 
 
+@pytest.mark.timing
 def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
     with CoreWaits(live.service.process.pid) as waited, CoreWaits(run.served.process.pid) as held:
         took_ms = red_after_stale_ms(live, run)
@@ -435,6 +436,7 @@ def red_after_death_ms(page: Browser, shown: Sky) -> float:
     return page.run("return window.redAt") - died_ms
 
 
+@pytest.mark.timing
 def test_when_the_run_dies_the_page_is_red(page, tmp_path):
     with sky(tmp_path) as shown, CoreWaits(page.service.process.pid) as waited:
         took_ms = red_after_death_ms(page, shown)

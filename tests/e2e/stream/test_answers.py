@@ -181,6 +181,7 @@ def test_a_growing_file_counts_from_the_start_on_and_again_when_it_is_made_anew(
         assert_answers(gathered(source, 3))
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("kind", ["device", "endless file"])
 def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
     """A link to /dev/zero is let go; a file of zeros to 64 GB is read and dropped, no faster

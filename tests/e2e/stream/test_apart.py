@@ -132,6 +132,7 @@ def seen_late_ns(link, put) -> int:
     return arrival.host_ns - left_ns
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("road", [zmq_road, serial_road, udp_road, nasa42_road])
 @best_of_three(
     "the sender and the lock are of one process: what it waits for a core between them counts as"

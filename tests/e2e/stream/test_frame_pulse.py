@@ -47,6 +47,7 @@ def replayed(tmp_path, bench_file):
     return json.loads(done.stdout), done.stderr
 
 
+@pytest.mark.timing
 def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, server):
     with CoreWaits(os.getpid()) as waited:
         summary, _ = replayed(tmp_path, bench(tmp_path, server.url, pulse_ms=20))

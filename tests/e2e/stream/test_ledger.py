@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from PIL import Image
 
@@ -144,6 +145,7 @@ def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
     assert_refused(refused, 2, "run.mcap", "--step")
 
 
+@pytest.mark.timing
 def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:

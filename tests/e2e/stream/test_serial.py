@@ -160,6 +160,7 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
     assert summary["receive_latency_ms"]["p50"] < 30
 
 
+@pytest.mark.timing
 def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(
     tmp_path, cable, bench_file
 ):
@@ -228,6 +229,7 @@ def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
     )
 
 
+@pytest.mark.timing
 @best_of_three("a busy machine writes less than a flood to its pty")
 def test_more_packets_than_a_run_looks_at_are_passed_over_and_the_run_ends_in_order(tmp_path):
     """Every packet in a write of its own, as a USB-CDC device sends them, whatever its baud

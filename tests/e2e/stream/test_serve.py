@@ -60,6 +60,7 @@ SUMMARY_KEYS |= {
 }
 
 
+@pytest.mark.timing
 def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
     """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes
     of no form.

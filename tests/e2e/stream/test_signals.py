@@ -120,6 +120,7 @@ def serve_file(folder: Path, port: int, more: str = "") -> Path:
     return path
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_run_in_order(tmp_path, number):
     """Also where SIGINT is ignored on entry, as a shell does it for what it runs with `&`; not
@@ -145,6 +146,7 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
     assert len(read_log(ledger)) > 0
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize("before", [WITHOUT_LOCK, WITH_LOCK])
 def test_a_draw_without_end_is_ended(tmp_path, small_bench_file, number, before):
@@ -289,6 +291,7 @@ def full_pipe() -> Iterator[int]:
         os.close(writing)
 
 
+@pytest.mark.timing
 def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_path):
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port), full_pipe() as log:
@@ -317,6 +320,7 @@ def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_pat
     assert json.loads(out)["frames"] > 10
 
 
+@pytest.mark.timing
 def test_a_summary_that_nobody_reads_does_not_hold_up_the_end(tmp_path):
     with full_pipe() as stdout:
         command = program("serve", serve_file(tmp_path, free_port()), "--headless")
@@ -442,6 +446,7 @@ def other_commands(folder: Path, bench: Path) -> dict[str, list[str]]:
     }
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize(
     "name", ["send", "demo", "replay", "verify", "benchmark", "study", "lockstep"]
 )

@@ -121,6 +121,7 @@ def test_of_every_third_frame(kept):
     assert summary.pulses + summary.skipped == 3
 
 
+@pytest.mark.timing
 def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
     line = Line()
     with FramePulse(line, settings(), Notices()) as pulse:

@@ -357,6 +357,7 @@ def test_a_mistyped_line_is_none_of_these(line):
     assert obeyed(line.encode("latin-1") + b"\r\n", []) == ([line], False)
 
 
+@pytest.mark.timing
 def test_a_number_of_four_thousand_digits_is_refused_at_once():
     begun_s = time.process_time()
     assert error_of(f"SKY:ATT {'1' * 4000}!,0,0,0") == -121

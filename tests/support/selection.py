@@ -1,0 +1,105 @@
+"""Which tests the bare command `pytest` runs, and what it says of the others.
+
+Laws. The bare command holds each room's claims in three minutes of two idle cores. It leaves out
+what needs more than README installs for it (an X server, a browser), what claims a time, and what
+takes longest, and counts these by reason. Tests that are asked for by a path, `-k` or `-m` are all
+run, and so are all by `--all`. What `--all` adds is `--rest`, beside each other, and `--timing`,
+one at a time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent.parent
+TIMING_REASON = "claim a time, and run one at a time"
+SLOW_REASON = "take longest (tests/slow.txt)"
+REASONS_BY_FOLDER = {
+    "timing": TIMING_REASON,
+    "screen": "need an X server",
+    "browser": "need a browser",
+    "study": "run a whole study",
+}
+# Functions that take over a stated time of CPU, all their cases together; tools/slow_tests.py
+# measures them and writes the file.
+SLOW = frozenset((TESTS / "slow.txt").read_text().split())
+LEFT_OUT = pytest.StashKey[dict[str, int]]()
+
+
+def add_options(parser: pytest.Parser) -> None:
+    """`--all`, `--rest` and `--timing`."""
+    group = parser.getgroup("hilstar")
+    group.addoption("--all", action="store_true", help="every test, also those that take long")
+    group.addoption("--rest", action="store_true", help="what --all adds, without --timing's")
+    group.addoption("--timing", action="store_true", help="what claims a time: use it with -n0")
+
+
+def reason_to_leave_out(item: pytest.Item) -> str | None:
+    """Why the bare command does not run a test; None if it does."""
+    if item.get_closest_marker("timing") is not None:
+        return TIMING_REASON
+    for folder in item.path.relative_to(TESTS).parts[:-1]:
+        if folder in REASONS_BY_FOLDER:
+            return REASONS_BY_FOLDER[folder]
+    if item.nodeid.partition("[")[0] in SLOW:
+        return SLOW_REASON
+    return None
+
+
+def is_bare(config: pytest.Config) -> bool:
+    """Whether the command names no tests of its own."""
+    worker_input = getattr(config, "workerinput", None)
+    if worker_input is not None:
+        # a worker is given every path by name, also of a command that names none
+        return bool(worker_input["is_bare"])
+    option = config.option
+    if config.args_source is pytest.Config.ArgsSource.ARGS:
+        return False
+    return not (option.keyword or option.markexpr or option.lf or option.failedfirst)
+
+
+def select(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Take out of `items`, in place, what this command leaves out, and count it by reason."""
+    option = config.option
+    asks_for_a_part = option.rest or option.timing
+    if option.all or not (asks_for_a_part or is_bare(config)):
+        return
+    chosen: list[pytest.Item] = []
+    left_out: list[pytest.Item] = []
+    reasons: Counter[str] = Counter()
+    for item in items:
+        reason = reason_to_leave_out(item)
+        if option.timing:
+            is_chosen = reason == TIMING_REASON
+        elif option.rest:
+            is_chosen = reason not in (None, TIMING_REASON)
+        else:
+            is_chosen = reason is None
+        if is_chosen:
+            chosen.append(item)
+            continue
+        left_out.append(item)
+        reasons[reason or "are run by the bare command"] += 1
+    items[:] = chosen
+    config.hook.pytest_deselected(items=left_out)
+    config.stash[LEFT_OUT] = dict(reasons)
+
+
+def hand_on(session: pytest.Session) -> None:
+    """A worker's counts go to the process that reports: workers alone collect."""
+    output = getattr(session.config, "workeroutput", None)
+    if output is not None:
+        output["left_out"] = session.config.stash.get(LEFT_OUT, {})
+
+
+def report(reporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """A line for each reason."""
+    reasons = config.stash.get(LEFT_OUT, {})
+    if not reasons:
+        return
+    reporter.section("left out; pytest --all runs these too")
+    for reason, count in sorted(reasons.items(), key=lambda row: -row[1]):
+        reporter.write_line(f"{count:6d} {reason}")

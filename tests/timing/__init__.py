@@ -1,0 +1,1 @@
+"""Tests that claim a time: they run one at a time, after all others."""

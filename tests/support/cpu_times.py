@@ -1,5 +1,5 @@
 """A plugin of pytest that writes the CPU time of each test: `-p tests.support.cpu_times`, for
-tools/slow_tests.py.
+tests/support/slow_tests.py.
 
 It writes a file a process into the folder that HILSTAR_CPU_TIMES names: a row a test, its seconds
 of CPU with those of its children, a tab, and its name. CPU time is the same on a busy machine as on

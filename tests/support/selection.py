@@ -23,7 +23,7 @@ REASONS_BY_FOLDER = {
     "browser": "need a browser",
     "study": "run a whole study",
 }
-# Functions that take over a stated time of CPU, all their cases together; tools/slow_tests.py
+# Functions that take over a stated time of CPU, all their cases together; tests/support/slow_tests.py
 # measures them and writes the file.
 SLOW = frozenset((TESTS / "slow.txt").read_text().split())
 LEFT_OUT = pytest.StashKey[dict[str, int]]()

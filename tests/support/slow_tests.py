@@ -1,7 +1,6 @@
-#!/usr/bin/env python3
 """Measure the CPU time of every test, and write those that take longest into tests/slow.txt.
 
-    python tools/slow_tests.py [--from FOLDER]
+    python -m tests.support.slow_tests [--from FOLDER]
 
 A function is slow when all its cases together take over MAX_CPU_S; the bare command `pytest` leaves
 it out. A folder's fixture is charged to the first test that asks for it. `--from` reads a run that
@@ -18,9 +17,7 @@ import tempfile
 from collections import defaultdict
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
+from tests.support.benches import ROOT
 from tests.support.cpu_times import FOLDER
 from tests.support.selection import REASONS_BY_FOLDER
 

@@ -59,15 +59,34 @@ def opened_picture(
     data: bytes, size_px: tuple[int, int] | None = None, formats: Sequence[str] = FORMATS
 ) -> Iterator["Image.Image"]:
     """A picture, not decoded yet, of this (width, height) if any is wanted. Raises
-    ImageSizeError, and whatever Pillow does.
+    ImageSizeError, also for several of one size in a file, and whatever Pillow does.
     """
     from PIL import Image
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's about large ones, which are refused here
-        with Image.open(io.BytesIO(data), formats=tuple(formats)) as picture:
+        try:
+            opened = Image.open(io.BytesIO(data), formats=tuple(formats))
+        except Image.DecompressionBombError as error:
+            raise ImageSizeError("has more pixels than any image that is decoded") from error
+        with opened as picture:
             _check_size(picture.size, size_px)
+            _check_single(picture)
             yield picture
+
+
+def _check_single(picture: "Image.Image") -> None:
+    """Refuse a stack of exposures, of which only the first would be taken; a smaller second image
+    is a preview.
+    """
+    count = getattr(picture, "n_frames", 1)
+    if count == 1:
+        return
+    size_px = picture.size
+    picture.seek(1)
+    if picture.size == size_px:
+        raise ImageSizeError(f"holds {count} images of one size; write one image a file")
+    picture.seek(0)
 
 
 def unpacked(data: bytes, limit_bytes: int = MAX_UNPACKED_BYTES) -> bytes:

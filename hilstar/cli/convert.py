@@ -17,11 +17,15 @@ def convert(
     statements: options.LogStatements = options.NOTHING_STATED,
 ) -> None:
     """Convert an attitude log to another format."""
+    from hilstar.attitude.clock.resolution import coarse_lines
     from hilstar.attitude.logs.log_file import open_log, write_log
 
     options.check_files([log], [output])
     read = open_log(log, statements.stated())
-    for _, line in read.told:
+    for _, line in [*read.told, *coarse_lines(read.samples)]:
         say(line)
+    doubt = read.joins().doubt
+    if doubt:
+        say(doubt)
     write_log(output, read.samples, read.conventions.scale)
     typer.echo(f"{len(read.samples)} attitudes in {output}")

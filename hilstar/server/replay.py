@@ -18,7 +18,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.logs.log_formats import NOTHING_STATED, check_stated
-from hilstar.attitude.logs.log_times import span_line
+from hilstar.attitude.logs.log_times import TIMES, span_line
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import rate_refusal
@@ -48,6 +48,7 @@ from hilstar.server.serve import Outlet, Running
 from hilstar.server.summary import RunSummary
 
 MAX_FRAMES = 100_000_000
+ROUNDING = 1e-6  # of a frame, by which a span of whole steps may fall short
 # `exact` in NumPy is another program than its shader: of two choices that are as good it may take
 # the other.
 OTHER_CODES_BY_NUMPY = 0.35
@@ -181,7 +182,6 @@ def plan_play(
     Of a ledger those that its run drew. `stated` is what the log does not say itself. Raises
     InputError for a speed, a span or a step that gives no frame.
     """
-    factor = wanted.speed
     check_stated(log, stated)
     if is_mcap(log) and not holds_ros(log):
         frames = drawable_frames(log, math.radians(config.attitude.max_rate_deg_s))
@@ -196,19 +196,13 @@ def plan_play(
         refusal = rate_refusal(sample, math.radians(config.attitude.max_rate_deg_s))
         if refusal is not None:
             raise InputError(f"{log}: attitude {number}: {refusal.detail}")
-    start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
-    step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
-    if wanted.step_s is not None:
-        if wanted.step_s <= 0 or factor not in {1.0, math.inf}:
-            raise InputError(
-                f"--step {wanted.step_s:g}: write seconds above 0, with --speed realtime or max"
-            )
-        step_s = wanted.step_s
-    count = (stop_s - start_s) / step_s + 1e-6
-    if count > MAX_FRAMES:
-        raise InputError(
-            f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop"
-        )
+    try:
+        start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
+        step_s = _frame_step_s(log, wanted, config.monitor.refresh_hz, stop_s - start_s)
+    except InputError as error:
+        # a span of the wrong length is most often one in the wrong unit
+        doubts = "".join(f"; {line}" for kind, line in read.told if kind == TIMES)
+        raise InputError(f"{error}{doubts}") from error
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
     joins = read.joins()
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
@@ -217,11 +211,29 @@ def plan_play(
         t_ns = first_ns + round(slot * step_s * NS_PER_S)
         return PlayedFrame(slot, t_ns, timeline.at(t_ns))
 
+    count = int((stop_s - start_s) / step_s + ROUNDING) + 1
     play = Play(
-        frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns
+        frame, count, len(timeline), not math.isinf(wanted.speed), first_ns, samples[0].t_ns
     )
     told = [*read.told, *joins.told, *coarse_lines(samples)]
     return replace(play, told=told, conventions=read.conventions, span=span_line(samples))
+
+
+def _frame_step_s(log: Path, wanted: Wanted, refresh_hz: float, length_s: float) -> float:
+    """The time of the log from frame to frame. Raises InputError where that gives too many."""
+    step_s = (1.0 if math.isinf(wanted.speed) else wanted.speed) / refresh_hz
+    if wanted.step_s is not None:
+        if wanted.step_s <= 0 or wanted.speed not in {1.0, math.inf}:
+            raise InputError(
+                f"--step {wanted.step_s:g}: write seconds above 0, with --speed realtime or max"
+            )
+        step_s = wanted.step_s
+    count = length_s / step_s + ROUNDING
+    if count > MAX_FRAMES:
+        raise InputError(
+            f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop"
+        )
+    return step_s
 
 
 def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:

@@ -56,6 +56,7 @@ UNKNOWN_DRIFT = 1e-4  # while nothing arrives, the clocks part by this share of 
 # what a slow clock may fall behind before it is known to be slow; more is surely a jump
 MAX_FOLLOWED_NS = 60 * NS_PER_S
 USUAL_SHARE = 0.95
+REMEDY = 'stamp with that clock, or write clock = "estimated"'
 MAX_OFF_NS = NS_PER_S  # a sender may predict, or be late
 MIN_FUTURE_NS = 5 * NS_PER_MS
 PERSISTENT_NS = NS_PER_S  # a queue may be older for a moment
@@ -370,8 +371,8 @@ class KnownClockFilter:
             self._notices.begin(CLOCK, self._line(self._least_late_ns), self._off_since_ns)
         if late_ns >= -MAX_OFF_NS:
             return [arrival]
-        detail = f"t_ns {t_ns} is {-late_ns / NS_PER_S:.3g} s ahead of this machine's clock"
-        return [replace(arrival, refusal=Refusal("time", detail))]
+        ahead = f"t_ns is {self._place(late_ns)}: {REMEDY}"
+        return [replace(arrival, refusal=Refusal("time", ahead, telling=True))]
 
     def _shared(self, host_ns: int) -> None:
         """A packet's time may be this machine's: the condition ends once that has lasted."""
@@ -410,18 +411,23 @@ class KnownClockFilter:
         )
 
     def _line(self, late_ns: int) -> str:
-        mode = self._clock.mode
-        where = (
-            f"{late_ns / NS_PER_S:.3f} s behind"
-            if late_ns > 0
-            else f"{-late_ns / NS_PER_S:.3f} s ahead of"
-        )
-        looks = "" if (other := clock_named(late_ns)) is None else f", as {other} is"
-        wrong = "" if late_ns > 0 else f"; the sky drawn is {-late_ns / NS_PER_S:.3f} s old"
+        other = clock_named(late_ns)
+        looks = "" if other is None else f", as {other} is"
+        wrong = ""
+        if late_ns < -MAX_OFF_NS:
+            wrong = "; its packets are refused"
+        elif late_ns < 0:
+            wrong = f"; the sky drawn is {-late_ns / NS_PER_S:.3f} s old"
         return (
-            f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this'
-            f' machine{looks}{wrong}: stamp with that clock, or write clock = "estimated"'
+            f'[attitude] clock = "{self._clock.mode}", but t_ns is {self._place(late_ns)}'
+            f"{looks}{wrong}: {REMEDY}"
         )
+
+    def _place(self, late_ns: int) -> str:
+        """Where a packet's time lies on this machine's clock."""
+        sense = "behind" if late_ns > 0 else "ahead of"
+        name = CLOCK_NAMES[self._clock.mode]
+        return f"{abs(late_ns) / NS_PER_S:.3f} s {sense} {name} of this machine"
 
     def forgive(self) -> None:
         """Jumps are never counted."""

@@ -21,7 +21,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Conventions, Mounting
 from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.rotation import conjugate, multiply, rotate, to_rotation_vector
-from hilstar.basics.units import NS_PER_S
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.wrong_sky import CONVENTION, RATES
 
 MIN_INTERVALS = 5
@@ -63,6 +63,9 @@ DEGREES = (("", 1.0), (" and in deg/s", UNITS["deg/s"]))
 SAME = np.eye(3)
 OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
 OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
+OFTEN_OFF = (
+    "they are off for seconds, and no lag explains that: are they new in each packet, and all axes?"
+)
 GROSS = "no unit, sign or order of axes explains them"
 
 
@@ -504,13 +507,21 @@ class LagFit(NamedTuple):
     """Rates against the turn over some seconds, medians, rad/s: how fast it turned, how far off
     rates are, and their lag.
 
-    `lag_s` is by how much rates are late, negative where they are early; 0 where none explains the
-    error.
+    `is_off` says that this is more than their noise and what rates may be off. `lag_s` is by how
+    much rates are late, negative where they are early; 0 where none explains the error.
     """
 
     fast_rad_s: float
     off_rad_s: float
-    lag_s: float
+    is_off: bool = False
+    lag_s: float = 0.0
+
+    @property
+    def lag_text(self) -> str:
+        """The lag in words; at the end of those that are tried it may be a longer one."""
+        sense = "late" if self.lag_s > 0 else "early"
+        more = " or more" if abs(self.lag_s) > MAX_LAG_S - LAG_STEPS_S[0] else ""
+        return f"{abs(self.lag_s) * NS_PER_S / NS_PER_MS:.0f} ms {sense}{more}"
 
 
 def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
@@ -528,7 +539,7 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
         float(np.median([stretch.error for stretch in stretches])),
     )
     if off <= 0.5 * max(MIN_OFF_RAD_S, OFF_SHARE * fast):
-        return LagFit(fast, off, 0.0)
+        return LagFit(fast, off)
     zero_ns = stretches[0].from_ns
     parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
     t_s = np.concatenate([[0.0], *parts])
@@ -549,10 +560,10 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     fast = max(float(np.median(np.linalg.norm(part, axis=1))) for part in (turn, rate))
     off = float(off_by(np.zeros(1))[0])
     if off <= max(MIN_OFF_RAD_S, OFF_SHARE * fast):
-        return LagFit(fast, off, 0.0)
+        return LagFit(fast, off)
     noise = _noise(stretches)
     if off <= NOISE_RATIO * noise:
-        return LagFit(fast, off, 0.0)
+        return LagFit(fast, off)
     lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEPS_S[0] / 2, LAG_STEPS_S[0])
     lag_s = _least(lags_s, off_by(lags_s))
     near_s = lag_s + np.arange(-LAG_STEPS_S[0], LAG_STEPS_S[0] + LAG_STEPS_S[1] / 2, LAG_STEPS_S[1])
@@ -562,7 +573,8 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
         float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise))
         and abs(lag_s) >= MIN_LAG_S
     )
-    return LagFit(fast, off, float(near_s[left.argmin()]) if explained else 0.0)
+    lag_s = float(near_s[left.argmin()]) if explained else 0.0
+    return LagFit(fast, off, is_off=True, lag_s=lag_s)
 
 
 def _turning_median(stretches: Sequence[Stretch]) -> float:

@@ -11,9 +11,9 @@ Laws:
    MIN_STRETCHES fit.
 4. Stretches of several lengths are compared: a short one finds a fast turn in half a second, a long
    one a slow turn in noise.
-5. Late rates fit and do not fit by turns: the last HISTORY_S are compared with the turn before, and
-   by the whole of it they are
-   right again.
+5. Late rates, and those that are renewed seldom, fit and do not fit by turns: the last HISTORY_S
+   are compared with the turn before. Rates that are off by it in OFF_LOOKS in a row are wrong,
+   though no lag explains them. By the whole of it they are right again.
 """
 
 import math
@@ -32,6 +32,7 @@ from hilstar.attitude.clock.rate_causes import (
     MIN_STRETCHES,
     MORE_STRETCHES,
     MUCH_LESS,
+    OFTEN_OFF,
     SAME,
     Cause,
     LagFit,
@@ -47,7 +48,7 @@ from hilstar.attitude.clock.rate_causes import (
 )
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.notices import Notices
-from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import ENDS, RATES
 
 WrongRates = Literal["use-quaternions", "warn", "off"]
@@ -62,6 +63,8 @@ HISTORY_S = 4.0
 LAG_EACH_NS = NS_PER_S // 2
 # comparisons in a row by which late rates are right again: a slow swing has times without an error
 LATE_NO_MORE = 8
+# comparisons in a row by which rates are wrong that no lag explains: by then a constant is named
+OFF_LOOKS = 8
 
 
 def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) -> Cause | None:
@@ -119,10 +122,12 @@ class _History:
     def __init__(self) -> None:
         self._stretches: deque[Stretch] = deque()
         self._next_ns: int | None = None
+        self._has_looked = False
 
     @property
-    def length_s(self) -> float:
-        if not self._stretches:
+    def looked_s(self) -> float:
+        """Over how long rates and turn have been compared."""
+        if not self._has_looked:
             return 0.0
         return (self._stretches[-1].to_ns - self._stretches[0].from_ns) / NS_PER_S
 
@@ -132,6 +137,7 @@ class _History:
 
     def clear(self) -> None:
         self._stretches.clear()
+        self._has_looked = False
 
     def add(self, stretch: Stretch) -> LagFit | None:
         """Take the next stretch; how rates and turn compare, twice a second."""
@@ -147,7 +153,9 @@ class _History:
         if self._next_ns is not None and 0 <= self._next_ns - stretch.to_ns <= LAG_EACH_NS:
             return None
         self._next_ns = stretch.to_ns + LAG_EACH_NS
-        return lag_of(self._stretches)
+        fit = lag_of(self._stretches)
+        self._has_looked = self._has_looked or fit is not None
+        return fit
 
 
 class RateCheck:
@@ -171,8 +179,9 @@ class RateCheck:
         self._notices = notices
         self._lengths = [_Length(length_s) for length_s in STRETCHES_S]
         self._history = _History()
-        self._late: LagFit | None = None  # as it was when rates were found to be late
-        self._no_more = 0
+        # as rates were when their history showed them to be late or off
+        self._late: LagFit | None = None
+        self._no_more = self._off_looks = 0
         # by which share of the turn rates were off when they were found to be wrong
         self._was_off = 0.0
         self._last_ns: int | None = None
@@ -225,7 +234,7 @@ class RateCheck:
             if all(fits(stretch, self._was_off) for stretch in newest):
                 self._end("the packets' rates are those of their quaternions again")
             return
-        cause = _first_cause(length, self._history.length_s, self._others)
+        cause = _first_cause(length, self._history.looked_s, self._others)
         if cause is not None:
             self._begin(cause, newest[-1], newest[0].from_ns, host_ns)
 
@@ -233,16 +242,12 @@ class RateCheck:
         found = self._history.add(stretch)
         if found is None:
             return
-        if self.cause is None and found.lag_s:
+        self._off_looks = self._off_looks + 1 if found.is_off else 0
+        if self.cause is None and (found.lag_s or self._off_looks == OFF_LOOKS):
             self._late = found
-            late = "late" if found.lag_s > 0 else "early"
-            text = (
-                f"they are {abs(found.lag_s) * NS_PER_S / NS_PER_MS:.0f} ms {late}: they fit the"
-                " turn of another moment"
-            )
-            self._begin(
-                Cause(text, SAME, lag_s=found.lag_s), stretch, self._history.from_ns, host_ns
-            )
+            late = f"they are {found.lag_text}: they fit the turn of another moment"
+            cause = Cause(late if found.lag_s else OFTEN_OFF, SAME, lag_s=found.lag_s)
+            self._begin(cause, stretch, self._history.from_ns, host_ns)
         elif self._late is not None and found.fast_rad_s > MUCH_LESS * self._late.fast_rad_s:
             was = self._late.off_rad_s / self._late.fast_rad_s
             fitting = not found.lag_s and found.off_rad_s < MUCH_LESS * was * found.fast_rad_s
@@ -251,7 +256,8 @@ class RateCheck:
                 self._end("the packets' rates are those of their quaternions again")
 
     def _begin(self, cause: Cause, stretch: Stretch, from_ns: int, host_ns: int | None) -> None:
-        self.cause, self._was_off, self._no_more = cause, off_share(stretch), 0
+        self.cause, self._was_off = cause, off_share(stretch)
+        self._no_more = self._off_looks = 0
         since_ns = None if host_ns is None else host_ns - (stretch.to_ns - from_ns)
         self._notices.begin(cause.kind, self._line(cause, stretch), since_ns)
 
@@ -286,6 +292,7 @@ class RateCheck:
             self._notices.end(kind, ENDS[kind], why)
 
     def _restart(self) -> None:
+        self._off_looks = 0
         self._history.clear()
         for length in self._lengths:
             length.samples.clear()

@@ -237,18 +237,32 @@ class LogJoins:
             )
             lines.append(("log-gap", f"the log has {gaps}, {sizes}; the attitude is held there"))
         if self.misfits:
-            misfits = f"in {self.misfits} intervals the log's rates do not fit its attitudes"
-            why = f"; probably {self.cause.text}" if self.cause is not None else ""
             if self.cause is not None and self.cause.reading is not None:
                 advice = self.cause.reading.advice
-                lines.append(
-                    (
-                        self.cause.kind,
-                        f"{misfits}{why}: the sky is drawn at another place; {advice}",
-                    )
+                elsewhere = (
+                    f"{self._misfits}{self._why}: the sky is drawn at another place; {advice}"
                 )
-            lines.append(("log-rates", f"{misfits}, and are ignored there{why}"))
+                lines.append((self.cause.kind, elsewhere))
+            lines.append(("log-rates", f"{self._misfits}, and are ignored there{self._why}"))
         return lines
+
+    @property
+    def doubt(self) -> str:
+        """What the log's rates say against its attitudes, for whoever draws nothing; "" where
+        they fit.
+        """
+        if not self.misfits:
+            return ""
+        reading = None if self.cause is None else self.cause.reading
+        return f"{self._misfits}{self._why}" + ("" if reading is None else f": {reading.advice}")
+
+    @property
+    def _misfits(self) -> str:
+        return f"in {self.misfits} intervals the log's rates do not fit its attitudes"
+
+    @property
+    def _why(self) -> str:
+        return "" if self.cause is None else f"; probably {self.cause.text}"
 
 
 def log_joins(

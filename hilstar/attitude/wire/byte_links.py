@@ -392,14 +392,14 @@ class FileBytes(ByteLink):
     its beginning.
 
     A path that comes to name something else (a device, a FIFO, a directory) is let go and told: a
-    device may have bytes for ever. It is looked at again until it names a file.
+    device may have bytes for ever. It is looked at again until it names a file. So is a path that
+    names nothing, or what may not be read; a file that was open is read on meanwhile.
     """
 
     def __init__(self, path: Path, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         super().__init__(str(path), notices, clock)
         self._path, self._file, self._trouble = path, -1, ""
-        with contextlib.suppress(OSError):
-            self._follow()
+        self._follow()
         if self._file >= 0:
             os.lseek(self._file, 0, os.SEEK_END)
 
@@ -444,7 +444,13 @@ class FileBytes(ByteLink):
             self._clock.sleep(min(FILE_LOOK_S, end.left_s))
 
     def _follow(self) -> None:
-        named = self._path.stat()
+        """Read what the path names now; why it cannot be read is told while that lasts."""
+        try:
+            self._take(self._path.stat())
+        except OSError as error:
+            self._trouble = f"{self._path} cannot be read ({error.strerror})"
+
+    def _take(self, named: os.stat_result) -> None:
         kind = no_file_kind(named.st_mode)
         if kind:
             self._let_go(kind)
@@ -452,6 +458,7 @@ class FileBytes(ByteLink):
         if self._file < 0:
             self._open()
             return
+        self._trouble = ""
         held = os.fstat(self._file)
         if (held.st_ino, held.st_dev) != (named.st_ino, named.st_dev):
             self.close()

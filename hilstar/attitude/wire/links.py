@@ -28,6 +28,7 @@ MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
 PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
 OVER_NS = NS_PER_S  # a flood is over once no packet was dropped for this long
 MAX_LOOKED_AT = 1000  # passed-over packets searched for a discontinuity, which is declared once
+CLIENT_REJECTED = "client-rejected"  # the notice that a connection to a socket that binds was none
 WRONG_PEER = "link-rejected"  # the notice that something else than a sender is at the other side
 E_co = TypeVar("E_co", bound=Event, covariant=True)
 
@@ -187,7 +188,12 @@ class Link(Closing, ABC):
         """Why the other side gives no messages, as far as that shows: a line; "" where it does
         not.
         """
-        return "" if self.link_counts.connections else self._notices.latest(WRONG_PEER)
+        counts, wrong_peer = self.link_counts, self._notices.latest(WRONG_PEER)
+        if wrong_peer:
+            return "" if counts.connections else wrong_peer
+        # who binds counts connections from their begin on, so also those that it then rejects
+        is_alone = counts.connections <= counts.rejected
+        return self._notices.latest(CLIENT_REJECTED) if is_alone else ""
 
     def await_ready(self) -> None:
         """Wait until a sender is heard from the first read on: for a process that reads, and not

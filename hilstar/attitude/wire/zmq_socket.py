@@ -29,7 +29,7 @@ from hilstar.attitude.wire.keys import (
     load_public,
     load_secret,
 )
-from hilstar.attitude.wire.links import PAUSE_S, WRONG_PEER, Link, LinkCounts
+from hilstar.attitude.wire.links import CLIENT_REJECTED, PAUSE_S, WRONG_PEER, Link, LinkCounts
 from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -246,7 +246,7 @@ class _Doorkeeper:
         elif failure and self._bound:
             self._counts.rejected += 1
             self._notices.tell(
-                "client-rejected",
+                CLIENT_REJECTED,
                 f"a connection from {who or 'an unknown peer'} was rejected: {failure}",
             )
         elif self._look is None:

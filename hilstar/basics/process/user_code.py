@@ -38,7 +38,7 @@ def user_function(name: str, folder: Path, trust: Collection[str] = ()) -> Calla
         _check_place(package, str(folder.resolve()))
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # whatever a user's module does
+    except (Exception, SystemExit) as error:  # whatever a user's module does; a script may exit
         raise UserCodeError(
             f"{module_name} cannot be imported ({type(error).__name__}: {error})"
         ) from error

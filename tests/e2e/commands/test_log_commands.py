@@ -109,6 +109,22 @@ def test_convert_says_what_it_cannot(tmp_path, log):
     assert_refused(run_hilstar_here("convert", log, tmp_path / "no" / "out.csv"), 2, "out.csv")
 
 
+def test_convert_says_what_a_log_s_rates_and_digits_say_against_it(tmp_path, log):
+    turned = log.with_name("conjugates.jsonl")
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    for row in rows:
+        row["q"] = [row["q"][0], *(-part for part in row["q"][1:])]
+    turned.write_text("\n".join(map(json.dumps, rows)))
+    told = run_hilstar_here("convert", turned, tmp_path / "out.csv").stderr
+    assert "the conjugate of the quaternions: write --convention direction=cam_to_icrs" in told
+    for row in rows:
+        row["q"] = [round(part, 3) for part in row["q"]]
+    turned.write_text("\n".join(map(json.dumps, rows)))
+    told = run_hilstar_here("convert", turned, tmp_path / "out.csv").stderr
+    assert "steps of 0.001" in told
+    assert run_hilstar_here("convert", log, tmp_path / "out.csv").stderr == ""
+
+
 def test_fault_options_stand_alone_or_take_a_share(tmp_path):
     for options, said in (
         (["--lose", "110%"], "--lose 110%"),

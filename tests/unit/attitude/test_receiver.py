@@ -675,6 +675,17 @@ def test_what_is_no_unix_time_is_said_once():
     assert run.counts.refused_by["time"] == 600
 
 
+def test_a_clock_too_far_ahead_is_said_of_refused_packets_and_not_of_a_sky(caplog):
+    ahead = Sender(offset_ns=3600 * NS_PER_S)
+    run = Run(lambda t0: ahead.packets(t0, seconds(0, 2)), SHARED)
+    (line,) = [
+        line for line in caplog.messages if "[attitude] clock" in line and "refused (" not in line
+    ]
+    assert "its packets are refused: stamp with that clock" in line and "sky drawn" not in line
+    assert "3600.000 s ahead of CLOCK_MONOTONIC" in run.counts.shown["time"]
+    assert run.counts.shown["time"].endswith('or write clock = "estimated"')
+
+
 @pytest.mark.parametrize(
     ("ahead_s", "name"),
     [

@@ -177,3 +177,17 @@ def test_the_formats_that_are_let_in_are_read(rng):
         image.save(made, name)
         with opened_picture(made.getvalue(), (40, 30)) as picture:
             assert np.asarray(picture).shape == (30, 40)
+
+
+def saved_stack(path: Path, other_px: int) -> Path:
+    """A TIFF of two images, the first of 64 x 64 px, the second of a size of its own."""
+    first, second = (Image.new("L", (size, size), 9) for size in (64, other_px))
+    first.save(path, save_all=True, append_images=[second])
+    return path
+
+
+def test_a_stack_of_exposures_is_refused_and_a_preview_beside_an_image_is_not(tmp_path: Path):
+    with pytest.raises(InputError, match="holds 2 images of one size; write one image a file"):
+        read_image(saved_stack(tmp_path / "stack.tiff", 64))
+    image = read_image(saved_stack(tmp_path / "preview.tiff", 16))
+    assert image.shape == (64, 64) and (image == 9).all()

@@ -40,6 +40,16 @@ def log(tmp_path):
 
 
 @pytest.fixture
+def log_in_ms(log):
+    """The same with its times in ms, and rates that say so."""
+    rows = [line.split(",") for line in log.read_text().splitlines()[1:]]
+    lines = [",".join([str(1e3 * float(t)), *q, "0", "0", "-0.1"]) for t, *q in rows]
+    path = log.with_name("ms.csv")
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *lines]) + "\n")
+    return path
+
+
+@pytest.fixture
 def ledger(tmp_path, small_bench_file):
     return earlier_run(tmp_path / "run.mcap", small_bench_file)
 
@@ -200,3 +210,9 @@ def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():
         assert here.other_codes(other, "round") == QUANTISERS["round"].other_codes
         assert here.other_codes(other, "exact") == QUANTISERS["exact"].other_codes
     assert here.other_codes(replace(here, path="NumPy"), "exact") == OTHER_CODES_BY_NUMPY
+
+
+@pytest.mark.parametrize("wanted", [Wanted(MAX, stop_s=5000.0), Wanted(MAX, step_s=1e-6)])
+def test_a_span_that_is_refused_names_the_unit_of_the_log_s_times(config, log_in_ms, wanted):
+    with pytest.raises(InputError, match="probably the times are in ms"):
+        plan_play(log_in_ms, wanted, config)

@@ -78,3 +78,17 @@ def test_a_clock_of_another_pace_is_of_no_unit(pace):
     for k in range(500):
         unit.see(round(pace * k * NS_PER_S / 100), k * NS_PER_S // 100)
     assert not unit.named and UNIT not in notices.counts()
+
+
+def test_a_unit_that_was_named_stands_while_arrivals_are_uneven_and_goes_with_the_fault():
+    """Of a busy machine: in windows of 0.5 s some ends are 60 ms late, so paces are 12 % off."""
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(2000):
+        late_ns = 60_000_000 * (k // 50 % 2) if k > 200 else 0
+        unit.see(k * 10_000, k * NS_PER_S // 100 + late_ns)
+        assert unit.named == "microseconds" or k < 200
+    assert notices.counts() == {UNIT: 1}
+    for k in range(400):
+        unit.see(10**12 + k * NS_PER_S // 100, 21 * NS_PER_S + k * NS_PER_S // 100)
+    assert not unit.named and notices.counts() == {UNIT: 1, "time-unit-right": 1}

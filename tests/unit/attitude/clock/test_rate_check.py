@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.rate_causes import OTHER_AXES, ReadAs
+from hilstar.attitude.clock.rate_causes import OFTEN_OFF, OTHER_AXES, ReadAs
 from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
@@ -99,6 +99,8 @@ WRONGS: dict[str, tuple[Callable[[FloatArray, FloatArray], FloatArray], str]] = 
 
 FACTORS = (0.5, 0.75, 1.25, 1.5, 2.5)
 SWING_HZ, SWING_DEG_S = 0.5, 2.0
+# the history of 3 s, and eight looks of half a second
+OFTEN_OFF_WITHIN_S = 8.0
 LAG_WITHIN_S = 0.03  # of a lag, by noise of a coarse gyroscope
 LINES = {
     ("first", "cam_to_icrs"): '{ direction = "cam_to_icrs" }',
@@ -309,6 +311,39 @@ def test_late_rates_are_named_with_their_lag_and_stay_so(late_s, hz, noisy):
     assert (
         f"{abs(check.cause.lag_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'}" in told[0][1]
     )
+
+
+@pytest.mark.parametrize("hz", [20, 50, 100])
+@pytest.mark.parametrize("late_s", [0.4, -0.4])
+def test_a_lag_is_named_before_rates_are_only_called_far_off(hz, late_s):
+    """At 0.4 s of a swing of 2 s every rate is off by more than half: that alone says little."""
+    check, _, _ = watched(swing(late_s, hz))
+    assert abs(check.cause.lag_s - late_s) < LAG_WITHIN_S
+
+
+def tumbling(late_s: Callable[[FloatArray], FloatArray], seconds: float = 12.0, hz: float = 50.0):
+    """A turn about changing axes, whose rates are those of `late_s` (n,) before their times (n,)."""
+    before_s = 1.5
+    fine_s = np.arange(-before_s, seconds, FINE_S)
+    phases = np.stack([0.7 * fine_s, 1.1 * fine_s + 0.3, np.full_like(fine_s, 1.2)], axis=1)
+    rates = np.radians(1.5) * np.cos(phases)
+    t_s = np.arange(0, seconds, 1 / hz)
+    now, then = (
+        np.round((at_s + before_s) / FINE_S).astype(int) for at_s in (t_s, t_s - late_s(t_s))
+    )
+    return samples(np.round(t_s * NS_PER_S).astype(int), moved(rates, FINE_S)[now], rates[then])
+
+
+def test_a_lag_beyond_those_that_are_tried_is_told_as_at_least_that():
+    _, told, _ = watched(tumbling(lambda t_s: np.full_like(t_s, 0.6)))
+    assert [kind for kind, _ in told] == [WRONG] and " ms late or more: " in told[0][1]
+
+
+def test_rates_that_are_renewed_once_in_a_second_are_wrong_though_no_lag_explains_them():
+    check, told, first_s = watched(tumbling(lambda t_s: t_s % 1.0))
+    assert [kind for kind, _ in told] == [WRONG] and OFTEN_OFF in told[0][1]
+    assert check.distrusts and first_s < OFTEN_OFF_WITHIN_S
+    assert watched(tumbling(np.zeros_like))[1] == []
 
 
 def test_rates_that_are_late_no_more_are_believed_again():

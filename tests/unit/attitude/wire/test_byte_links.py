@@ -192,9 +192,34 @@ def test_a_path_that_names_no_regular_file_at_the_start_is_refused(tmp_path, kin
         assert taken(link) == b"" and kind in link.trouble()
 
 
+@pytest.mark.parametrize("then", ["gone", "a link to itself", "a link to nothing"])
+def test_a_file_that_cannot_be_read_any_more_is_told_while_that_lasts(tmp_path, then):
+    path, notices = tmp_path / "t.bin", Notices()
+    path.touch()
+    with FileBytes(path, notices, FakeClock()) as link:
+        assert taken(link) == b"" and link.trouble() == ""
+        path.unlink()
+        if then != "gone":
+            path.symlink_to(path if then == "a link to itself" else tmp_path / "nothing")
+        assert taken(link) == b"" and f"{path} cannot be read (" in link.trouble()
+        path.unlink(missing_ok=True)
+        path.write_bytes(b"two")
+        assert taken(link) == b"two" and link.trouble() == ""
+
+
+def test_a_file_that_comes_back_is_no_trouble_any_more(tmp_path):
+    path, aside = tmp_path / "t.bin", tmp_path / "aside.bin"
+    path.touch()
+    with FileBytes(path, Notices(), FakeClock()) as link:
+        path.rename(aside)
+        assert taken(link) == b"" and link.trouble()
+        aside.rename(path)
+        assert taken(link) == b"" and link.trouble() == ""
+
+
 def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path):
     path, notices = tmp_path / "t.bin", Notices()
     with FileBytes(path, notices, FakeClock()) as link:
-        assert taken(link) == b"" and link.trouble() == ""
+        assert taken(link) == b"" and "cannot be read (No such file" in link.trouble()
         path.symlink_to("/dev/zero")
         assert taken(link) == b"" and "a device" in link.trouble()

@@ -117,4 +117,13 @@ def test_another_type_of_socket_that_connects_to_ours_is_rejected_in_words() -> 
             end_s = time.monotonic() + WITHIN_S
             while not notices.latest("client-rejected") and time.monotonic() < end_s:
                 link.receive(POLL_MS)
+        # a line at the end of a run that had no attitude, in the place of "start the sender"
+        assert "another type of ZeroMQ socket" in link.trouble
+        with zmq.Context() as context, context.socket(zmq.XPUB) as made:
+            made.connect(link.endpoint)
+            end_s = time.monotonic() + WITHIN_S
+            while not made.poll(POLL_MS) and time.monotonic() < end_s:
+                link.receive(POLL_MS)
+            link.receive(POLL_MS)
+            assert link.trouble == ""
     assert "another type of ZeroMQ socket" in notices.latest("client-rejected")

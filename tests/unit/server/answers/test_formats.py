@@ -292,6 +292,13 @@ def test_a_python_function_decodes_and_its_faults_are_counted(tmp_path: Path):
         )
 
 
+def test_a_module_that_ends_the_program_is_refused_in_one_line(tmp_path):
+    (tmp_path / "exits.py").write_text("raise SystemExit(3)\n")
+    settings = settings_of(format="python:exits:decode", fields=[])
+    with pytest.raises(InputError, match=r"exits cannot be imported \(SystemExit: 3\)"):
+        AnswerDecoder(settings, None, False, tmp_path)
+
+
 @pytest.mark.parametrize(
     "name",
     ["os:system", "subprocess:run", "numpy:load", "os.path:join", "json:loads", "builtins:exec"],

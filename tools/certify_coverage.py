@@ -26,6 +26,7 @@ from tests.support.planted_certify import (
     Counted,
     coverage,
     coverage_by_images,
+    stated_directions,
     stated_lens,
 )
 from tests.support.planted_readings import KINDS
@@ -33,6 +34,11 @@ from tests.support.planted_readings import KINDS
 IMAGES = "images"
 UNSTATED = "tracker's own lens, not stated"
 OWN_LENS = "tracker's own lens"
+STATED = {
+    OWN_LENS: stated_lens(),
+    "tracker's own directions": stated_directions(),
+    UNSTATED: "",
+}
 SIGMAS = 3.0
 COLUMNS = (
     "kind",
@@ -90,14 +96,9 @@ def main() -> None:
         if kind == IMAGES:
             found = coverage_by_images(asked.benches, asked.seed)
         else:
-            tables = {UNSTATED: "", OWN_LENS: stated_lens()}.get(kind, EXACT_LENS)
-            found = coverage(
-                KINDS[OWN_LENS if kind == UNSTATED else kind],
-                asked.benches,
-                asked.seed,
-                keys,
-                tables,
-            )
+            draw = KINDS[OWN_LENS if kind == UNSTATED else kind]
+            tables = STATED.get(kind, EXACT_LENS)
+            found = coverage(draw, asked.benches, asked.seed, keys, tables)
         print(
             f"{kind}: {(time.process_time() - started) / asked.benches:.2f} s of CPU a bench",
             flush=True,

@@ -23,6 +23,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.planted_readings import (
     ARCSEC,
     DELAY_MS,
+    LENS_ARCSEC,
     SEEN_TANGENT,
     TRACKER_K1,
     WHITE_E_PER_S,
@@ -189,13 +190,15 @@ EXACT_LENS = "[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = 0
 
 
 def stated_lens() -> str:
-    """A statement of the tracker's lens as it is planted in `own_lens`: the largest of its
-    field, k = 2.
-    """
-    largest_arcsec = TRACKER_K1 * SEEN_TANGENT**3 * ARCSEC
-    return (
-        f"[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = {2 * largest_arcsec!r}\n"
-    )
+    """A statement of the tracker's lens as it is planted in `own_lens`, k = 2."""
+    edge_arcsec = TRACKER_K1 * SEEN_TANGENT**3 * ARCSEC
+    return f"{EXACT_LENS}distortion_expanded_arcsec = {2 * edge_arcsec!r}\n"
+
+
+def stated_directions() -> str:
+    """A statement of the tracker's directions as they are planted in `own_directions`, k = 2."""
+    expanded = f"direction_expanded_arcsec = {2 * LENS_ARCSEC!r}"
+    return f"[certify.tracker]\nname = 'planted'\n{expanded}\n"
 
 
 def coverage(

@@ -75,6 +75,10 @@ class Truth:
     uneven: Callable[[np.ndarray, np.ndarray], np.ndarray] = nothing
     dots_off: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...] = (nothing, nothing)
     tracker_k1: float = 0.0
+    lens_off_arcsec: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...] = (nothing, nothing)
+    warms: float = 0.0
+    warm_s: float = 1.0
+    talk: float = 0.0
     tails: bool = False
     lasts_readings: float = 0.0
 
@@ -159,11 +163,44 @@ def uneven(rng: np.random.Generator, length_px: float = 0.0, size: float = 0.0) 
 
 
 TRACKER_K1 = 0.02
+LENS_ARCSEC = 2.0
+HALF_FIELD_PX = 512
 
 
 def own_lens(rng: np.random.Generator) -> Truth:
-    """A tracker whose lens is not that of its bench file."""
+    """A tracker whose distortion is not that of its bench file."""
     return replace(supposed(rng), tracker_k1=rng.normal(0, TRACKER_K1))
+
+
+def own_directions(rng: np.random.Generator) -> Truth:
+    """A tracker whose directions are off by a smooth field, over a quarter of its field to all of
+    it.
+    """
+    length_px = HALF_FIELD_PX * _between(rng, 0.5, 2)
+    fields = [SmoothField(length_px, rng) for _ in range(2)]
+    off = tuple(lambda x, y, f=field: LENS_ARCSEC * f(x, y) for field in fields)
+    return replace(supposed(rng), lens_off_arcsec=off)
+
+
+def warming(rng: np.random.Generator) -> Truth:
+    """A monitor that was switched on just before: its light rises by 0.2 to 2 %, to a third in 0.5
+    to 20 minutes.
+    """
+    rises, warm_s = _between(rng, 0.002, 0.02), 60 * _between(rng, 0.5, 20)
+    return replace(supposed(rng), warms=rises, warm_s=warm_s)
+
+
+def s_curve(rng: np.random.Generator) -> Truth:
+    """A panel whose light follows a logistic curve of the code."""
+    steep, middle = rng.uniform(4, 10), rng.uniform(0.4, 0.8)
+    rising = 1 / (1 + np.exp(-steep * (np.arange(256) / 255 - middle)))
+    light = (rising - rising[0]) / (rising[-1] - rising[0])
+    return replace(supposed(rng), light=light)
+
+
+def talking(rng: np.random.Generator) -> Truth:
+    """A panel whose pixels are brighter or darker by 0.2 to 2 % beside lit ones, as in a star."""
+    return replace(supposed(rng), talk=_between(rng, 0.002, 0.02) * rng.choice([-1, 1]))
 
 
 def own_response(rng: np.random.Generator) -> Truth:
@@ -191,7 +228,11 @@ KINDS: dict[str, Callable[[np.random.Generator], Truth]] = {
     "correlated in place": in_place,
     "uneven light": uneven,
     "tracker's own lens": own_lens,
+    "tracker's own directions": own_directions,
     "other response": own_response,
+    "S-curve": s_curve,
+    "warming up": warming,
+    "pixels that talk": talking,
 }
 
 
@@ -225,9 +266,9 @@ class PlantedReader:
         """Light of the middle of the screen, a second a reading."""
         one, t_s = self.is_so, np.arange(len(codes), dtype=np.float64)
         here = one.even(*(np.array([side // 2]) for side in SIZE_PX))[0]
-        level = (
-            (one.light[codes] + one.black) * one.white * here * (1 + one.drift_per_h * t_s / 3600)
-        )
+        warmth = 1 + one.drift_per_h * t_s / 3600
+        warmth += one.warms * (1 - np.exp(-t_s / one.warm_s))
+        level = (one.light[codes] + one.black) * one.white * here * warmth
         return LightReadings(codes, level * (1 + one.reading_noise * self._series(len(codes))), t_s)
 
     def dots(self, x_px: np.ndarray, y_px: np.ndarray, images: int) -> DotReadings:
@@ -239,7 +280,9 @@ class PlantedReader:
         off = np.stack(
             [part(x, y) for part in one.dots_off], axis=1
         ) + one.dot_noise_px * self._noise((len(x), 2))
-        at = TRACKER_FOCAL_PX * seen + TRACKER_MIDDLE_PX + less * off
+        at = TRACKER_FOCAL_PX * seen + TRACKER_MIDDLE_PX
+        lens_off = np.stack([part(at[:, 0], at[:, 1]) for part in one.lens_off_arcsec], axis=1)
+        at += TRACKER_FOCAL_PX * lens_off / ARCSEC + less * off
         light = one.even(x, y) * (1 + less * one.reading_noise * self._noise((len(x),)))
         return DotReadings(x, y, at[:, 0], at[:, 1], light, 0.55, 0.001)
 
@@ -265,7 +308,7 @@ def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int 
         # a star's sigma.
         here = one.white / WHITE_E_PER_S * one.even(np.rint(x), np.rint(y))[0]
         found["flux", star.hip] = -2.5 * math.log10(
-            here * float(star.share @ (one.light[code] / expected[code]))
+            here * (1 + one.talk) * float(star.share @ (one.light[code] / expected[code]))
         )
         wanted = np.array(
             [(x[0] - (SIZE_PX[0] - 1) / 2) / FOCAL_PX, (y[0] - (SIZE_PX[1] - 1) / 2) / FOCAL_PX]

@@ -37,6 +37,7 @@ from hilstar.server.bench.build import (
     star_rates,
 )
 from hilstar.server.bench.catalogue import sigma_instrument_mag
+from hilstar.server.bench.config.certify import TrackerReferenceSettings
 from hilstar.sky.facts import errors_of, motion_at
 from hilstar.sky.star_table import choose_catalog, table_facts
 
@@ -667,6 +668,7 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
             "tracker's lens", "normal", source, 2 * len(at), direction / stated.k, "arcsec"
         )
         yield Effect(lens, place=place.reshape(-1, count, 2))
+    yield from _of_radial_errors(stated, figures.tangent, half, source)
     if (even := stated.evenness_expanded_relative) is None:
         missing.append(
             "vignetting: light over the field is as the tracker itself collects it, which counts as"
@@ -688,6 +690,23 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
     elif linear:
         scale = Input("tracker's linearity", "normal", source, 1, linear / stated.k, "relative")
         yield Effect(scale, even=np.full((1, count), linear / stated.k))
+
+
+def _of_radial_errors(
+    stated: TrackerReferenceSettings, tangent: FloatArray, half: float, source: str
+) -> Iterator[Effect]:
+    """The effects of the focal length and of the distortion of the tracker's lens: radial at
+    directions (n, 2), 0 at the boresight; `half` is the tangent at the edge of the field.
+    """
+    if focal := stated.focal_expanded_relative / stated.k:
+        moved = focal * ARCSEC_PER_RAD * tangent
+        scale = Input("tracker's focal length", "normal", source, 1, focal, "relative")
+        yield Effect(scale, place=moved[None])
+    if edge_arcsec := stated.distortion_expanded_arcsec / stated.k:
+        radius = np.linalg.norm(tangent, axis=1, keepdims=True) / half
+        moved = edge_arcsec * radius**2 * tangent / half
+        bent = Input("tracker's distortion", "normal", source, 1, edge_arcsec, "arcsec")
+        yield Effect(bent, place=moved[None])
 
 
 def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:

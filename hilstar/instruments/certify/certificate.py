@@ -161,7 +161,11 @@ def certify(
 
 
 def _never_assessed(settings: CertifySettings) -> list[str]:
-    found = ["focus, stray light and the shape of stars: the figures are of their light and middle"]
+    found = [
+        "focus, stray light and the shape of stars: the figures are of their light and middle",
+        "pixels that change each other's light: a star's is taken as the sum of its pixels, each as"
+        " it is read among others of its code or of black",
+    ]
     found += [
         f"{what} is not written in [certify]"
         for what in ("who", "where", "ambient", "traceability")

@@ -152,12 +152,14 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     # nothing from their freedom.
     lit = np.maximum(mean[place] - mean[0], 0.0)
     bright, dark = lit > BRIGHT * lit.max(), place == 0
-    shape = np.ones(len(read.code))
-    if read.noise_shape is not None:
-        shape = read.noise_shape / float(np.median(read.noise_shape[bright]))
-        # What a black image adds to a reading's noise is in its shape.
+    by_shape = lit
+    if read.noise is not None:
+        # By light, and not by each reading's own: of two readings of a faint code that with less
+        # light would count less, and their mean be too bright.
+        relative = float(np.median(read.noise[bright] / lit[bright]))
+        by_shape = np.where(dark, 0.0, read.noise / relative)
+        # What a black image adds to a reading's noise is in it.
         bright = ~dark
-    by_shape = lit * shape
     # A code whose readings average below black has no noise of light, only that of black.
     bright &= by_shape > 0
     noise, floor = 1.0, 0.0

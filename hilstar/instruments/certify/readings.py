@@ -58,9 +58,8 @@ class LightReadings:
 
     It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings
     have in common, as the ratios of lattices, is in `common` (n, inputs), one sigma relative to
-    light. `noise_shape` (n,) is each
-    reading's noise relative to its light, up to a factor that their scatter tells; None where all
-    are alike.
+    light. `noise` (n,) is each
+    reading's noise, e-/s, up to a factor that their scatter tells; None where it goes with light.
     """
 
     code: IntArray
@@ -68,7 +67,7 @@ class LightReadings:
     t_s: FloatArray
     square_px: tuple[int, int, int] | None = None
     common: FloatArray | None = None
-    noise_shape: FloatArray | None = None
+    noise: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +302,7 @@ class ImageReader:
             t_s,
             square_px=(meter.field.left, meter.field.top, meter.field.side),
             common=_common(readings),
-            noise_shape=_noise_shape(readings),
+            noise=readings.sigma * gain,
         )
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
@@ -360,18 +359,6 @@ class ImageReader:
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
         return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
-
-
-def _noise_shape(readings: Readings) -> FloatArray:
-    """The noise (n,) of readings relative to their light, 1 where they are black.
-
-    A lattice of few dots collects less light in the same pixels than a dense one, and knows its
-    light less well.
-    """
-    lit = np.flatnonzero([patch.code for patch in readings.patches])
-    shape = np.ones(len(readings.patches))
-    shape[lit] = readings.sigma[lit] / np.maximum(readings.above_black[lit], NO_LIGHT_DN_PER_S)
-    return shape
 
 
 def _common(readings: Readings) -> FloatArray:

@@ -32,8 +32,14 @@ class TrackerReferenceSettings(Table, frozen=True):
 
     name: str = ""  #: What calibrated it: laboratory, report and serial number.
     #: Expanded uncertainty of a direction by the lens of `[tracker]`, along each axis, anywhere in
-    #: its field; 0 where it is the measure of all angles. Default: not assessed
+    #: its field, beside those of the next two; 0 where it is the measure of all angles. Default:
+    #: not assessed
     direction_expanded_arcsec: NotNegative | None = None
+    #: Expanded uncertainty of its focal length, relative: it scales angles from the boresight.
+    focal_expanded_relative: Relative = 0.0
+    #: Expanded uncertainty of its radial distortion at the edge of the field, half of the
+    #: detector's smaller side from the middle. It grows as the cube of the angle off the boresight.
+    distortion_expanded_arcsec: NotNegative = 0.0
     #: Expanded uncertainty of the light that it collects at a place over that in the middle of its
     #: field (vignetting, flat field), relative. Default: not assessed
     evenness_expanded_relative: Relative | None = None

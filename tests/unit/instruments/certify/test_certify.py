@@ -280,7 +280,7 @@ def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) 
         * np.where(codes > 0, rng.standard_normal(len(codes)), 0.01 * rng.standard_normal())
     )
     deviation = light_deviation(
-        file, LightReadings(codes, noisy, np.zeros(len(codes)), noise_shape=shape)
+        file, LightReadings(codes, noisy, np.zeros(len(codes)), noise=shape * light)
     )
     sigma = np.linalg.norm(deviation.factors, axis=1) / deviation.value
     assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
@@ -302,13 +302,34 @@ def test_a_faint_code_that_reads_below_black_does_not_undo_the_others(tmp_path) 
     light = black + grey_response(file).light[codes] * 1e6
     light += np.where(codes > 0, 1e-4 * (light - black), 1.0) * rng.standard_normal(len(codes))
     light[codes == 1] = black - np.array([30.0, 31.0, 32.0])
-    shape = np.where(codes == 1, 1e9, 1.0)
-    readings = LightReadings(codes, light, np.zeros(len(codes)), noise_shape=shape)
+    noise = np.where(codes > 1, 1e-4 * (light - black), 1.0)
+    readings = LightReadings(codes, light, np.zeros(len(codes)), noise=noise)
     deviation = light_deviation(file, readings)
     off = deviation.value * WHITE_E_PER_S / 1e6 - 1
     assert np.abs(off[1:]).max() < 1e-3
     assert np.isfinite(deviation.factors).all()
     assert deviation.noise == pytest.approx(1e-4, rel=0.5)
+
+
+def test_of_two_readings_of_a_faint_code_the_darker_counts_as_much(tmp_path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    )
+    file = read_bench_file(path)
+    lit = [1, 20, 80, 160, 255]
+    codes = np.array([0, *lit, 0, *lit, 0, 0])
+    light = 1e3 + grey_response(file).light[codes] * WHITE_E_PER_S
+    light[codes == 0] += [1.0, -1.0, 1.0, -1.0]
+    faint = codes == 1
+    true = float(light[faint][0]) - 1e3
+    light[faint] += true / 2 * np.array([1, -1])
+    light[codes > 1] *= 1 + 1e-6 * np.resize([1, -1], int((codes > 1).sum()))
+    noise = np.where(faint, true, 1e-5 * light)
+    deviation = light_deviation(
+        file, LightReadings(codes, light, np.zeros(len(codes)), noise=noise)
+    )
+    assert deviation.value[0] == pytest.approx(1, abs=1e-4)
 
 
 def test_three_readings_hold_the_truth_by_their_t() -> None:

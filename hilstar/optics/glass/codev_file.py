@@ -28,6 +28,7 @@ from hilstar.optics.glass.lens_data import (
     PupilKind,
     Shape,
     glass_of_code,
+    lens_text,
     nth,
     only_aperture,
 )
@@ -133,10 +134,9 @@ def _statements(data: bytes) -> Iterator[LensLine]:
 
     `;` ends one, `&` at a line's end goes on, `!` begins a comment; quoted words are whole.
     """
-    text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     before = ""
     start = 0
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(lens_text(data).splitlines(), 1):
         start = start if before else number
         whole = before + _without_comment(line)
         if whole.rstrip().endswith("&"):

@@ -3,6 +3,7 @@
 Readers of formats (`zemax_file.py`, `codev_file.py`) make one; `optiland_lens.py` traces it.
 """
 
+import codecs
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
+from hilstar.basics.reading import HEAD_BYTES, wide_encoding
 
 # Lens units: an object this far is at infinity (OpticStudio's rule; CODE V writes 1e11 and more).
 MIN_INFINITE = 1e10
@@ -32,6 +34,14 @@ Shape = Literal["circle", "rectangle", "ellipse", "spider"]
 def nth(values: Sequence[float], number: int) -> float:
     """A value of a list that may end earlier; 0 behind its end."""
     return values[number] if number < len(values) else 0.0
+
+
+def lens_text(data: bytes) -> str:
+    """The text of a lens file's bytes: UTF-16 as OpticStudio writes it, or any of one byte."""
+    wide = wide_encoding(data[:HEAD_BYTES])
+    if wide is not None:
+        return data.decode(wide, errors="replace").removeprefix("\ufeff")
+    return data.removeprefix(codecs.BOM_UTF8).decode("latin-1")
 
 
 class LensLine:

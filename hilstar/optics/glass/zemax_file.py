@@ -23,6 +23,7 @@ from hilstar.optics.glass.lens_data import (
     LensPrescription,
     LensSurface,
     PupilKind,
+    lens_text,
     nth,
     only_aperture,
 )
@@ -172,11 +173,7 @@ def read_zemax(data: bytes) -> LensPrescription:
 
 
 def _lines(data: bytes) -> Iterator[LensLine]:
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        text = data.decode("utf-16", errors="replace")
-    else:
-        text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(lens_text(data).splitlines(), 1):
         items = line.split()
         if items:
             yield LensLine(number, items[0].upper(), items[1:], line)

@@ -20,7 +20,7 @@ import csv
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import date, time, timedelta
@@ -351,10 +351,10 @@ class TextTable:
         """The column that says which rows hold, or which do not, by any of its names, if there is
         one.
         """
-        places = self._about(VALID_WORDS)
+        places = self._about(True)
         if places:
             return Chosen(self._only(VALID, places))
-        places = self._about(INVALID_WORDS)
+        places = self._about(False)
         return Chosen(self._only("invalid", places), inverted=True) if places else None
 
     def _places(self, names: Sequence[str]) -> list[int]:
@@ -366,12 +366,11 @@ class TextTable:
                 places.append(place)
         return places
 
-    def _about(self, words: frozenset[str]) -> list[int]:
-        """The places of columns with one of the words, whose others are in SUBJECT_WORDS."""
+    def _about(self, holds: bool) -> list[int]:
+        """The places of the columns whose flags say which rows hold, or which do not."""
         places = []
         for place, column in enumerate(self.columns):
-            own = name_words(column.name)
-            if own & words and own - words <= SUBJECT_WORDS:
+            if validity_of_name(column.name) is holds:
                 places.append(place)
         return places
 
@@ -483,6 +482,15 @@ def _decimals(text: str) -> int:
 def name_words(text: str) -> frozenset[str]:
     """The words of a name in small letters: AttitudeValid and attitude_valid have the same."""
     return frozenset(word.casefold() for word in WORD.findall(text))
+
+
+def validity_of_name(name: str) -> bool | None:
+    """Whether flags of that name say what holds (True) or what does not; None for other names."""
+    words = name_words(name)
+    for known, holds in ((VALID_WORDS, True), (INVALID_WORDS, False)):
+        if words & known and words - known <= SUBJECT_WORDS:
+            return holds
+    return None
 
 
 def is_no_number(text: str) -> bool:
@@ -630,11 +638,18 @@ def _are_numbered(rows: Sequence[list[str]], count: int) -> bool:
 
 
 def _title_lines(sample: Sequence[str]) -> int:
-    """How many lines stand above the header, which has as many cells as the first row."""
+    """How many lines stand above the header, which has as many cells as the first row: one of
+    numbers alone or, where no row is, one with a number.
+    """
+    return _lines_above(sample, all) or _lines_above(sample, any)
+
+
+def _lines_above(sample: Sequence[str], which: Callable[[Iterable[bool]], bool]) -> int:
     for place, line in enumerate(sample[:MAX_TITLE_LINES]):
         delimiter = delimiter_of(sample[place:]) if line.strip() else ","
         row = split(line, delimiter)
-        if len(row) < 2 or not all(is_number(cell) or is_no_number(cell) for cell in row):
+        numbers = [is_number(cell) or (which is all and is_no_number(cell)) for cell in row]
+        if len(row) < 2 or not which(numbers):
             continue
         for above, text in enumerate(sample[:place]):
             cells = split(text, delimiter)

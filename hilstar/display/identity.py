@@ -46,6 +46,7 @@ NO_SERIAL_WORDS = frozenset(
         *("serial", "serialno", "serialnumber", "sn", "number", "monitor", "display"),
         *("demo", "demoset", "sample", "test", "dummy", "tobefilledbyoem"),
         *("prototype", "engsample", "generic", "panel", "lcd", "hdmi"),
+        "linux",  # of the EDIDs that the kernel has built in: "Linux #0"
         *("notavailable", "notapplicable", "notspecified", "notset"),
     }
 )

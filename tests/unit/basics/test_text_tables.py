@@ -254,6 +254,10 @@ def test_comments_between_rows_are_passed_over(table, comment):
 SURROUNDINGS = {
     "title": (f"Log of today\n\n{PLAIN}", "2 lines above"),
     "values above": (f"Date,2024-01-01,10:00\nRate\n{PLAIN}", "2 lines above"),
+    "title above words": (
+        "A list of today\nx_px,t_s,name\n10.25,0.5,a\n11.25,1.5,b\n",
+        "line above",
+    ),
     "numbers of rows": ('t_s,x_px\n"1",0.5,10.25\n"2",1.5,11.25\n"3",2.5,12.25\n', "its number"),
     "units in square brackets": ("t,x\n[s],[px]\n0.5,10.25\n1.5,11.25\n", ""),
     "units in round ones": ("t,x\n(s),(px)\n0.5,10.25\n1.5,11.25\n", ""),

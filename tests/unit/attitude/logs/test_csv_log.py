@@ -133,6 +133,24 @@ def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(log):
     )
 
 
+@pytest.mark.parametrize("key", ["is_valid", "attitudeValid", "st_valid"])
+def test_json_says_what_holds_by_the_names_of_tables(log, key):
+    rows = [f'{{"t_ns": {k}, "q": [{Q}], "{key}": {"false" if k else "true"}}}\n' for k in (0, 1)]
+    found = open_log(log("".join(rows)))
+    assert [sample.t_ns for sample in found.samples] == [0]
+    assert "1 line is marked as not valid" in dict(found.told)["log-valid"]
+
+
+@pytest.mark.parametrize("q", ["null", "[null, null, null, null]", "[NaN, NaN, NaN, NaN]"])
+def test_json_without_a_quaternion_is_left_out_at_the_start_and_refused_later(log, q):
+    blank, row = f'{{"t_ns": 0, "q": {q}}}\n', f'{{"t_ns": 5, "q": [{Q}]}}\n'
+    found = open_log(log(blank + row, "log.jsonl"))
+    assert [sample.t_ns for sample in found.samples] == [5]
+    assert "1 attitude is left out at the beginning" in dict(found.told)["log-start"]
+    with pytest.raises(InputError, match=r"log\.jsonl:2: .*dropout"):
+        open_log(log(row + blank, "log.jsonl"))
+
+
 @pytest.mark.parametrize(
     ("header", "good", "bad"),
     [

@@ -646,7 +646,9 @@ def _title_lines(sample: Sequence[str]) -> int:
 
 def _lines_above(sample: Sequence[str], which: Callable[[Iterable[bool]], bool]) -> int:
     for place, line in enumerate(sample[:MAX_TITLE_LINES]):
-        delimiter = delimiter_of(sample[place:]) if line.strip() else ","
+        if not line.strip() or _is_comment(line):
+            continue
+        delimiter = delimiter_of(sample[place:])
         row = split(line, delimiter)
         numbers = [is_number(cell) or (which is all and is_no_number(cell)) for cell in row]
         if len(row) < 2 or not which(numbers):

@@ -258,6 +258,7 @@ SURROUNDINGS = {
         "A list of today\nx_px,t_s,name\n10.25,0.5,a\n11.25,1.5,b\n",
         "line above",
     ),
+    "comments behind": (f"{PLAIN}# the end\n% of it\n", ""),
     "numbers of rows": ('t_s,x_px\n"1",0.5,10.25\n"2",1.5,11.25\n"3",2.5,12.25\n', "its number"),
     "units in square brackets": ("t,x\n[s],[px]\n0.5,10.25\n1.5,11.25\n", ""),
     "units in round ones": ("t,x\n(s),(px)\n0.5,10.25\n1.5,11.25\n", ""),

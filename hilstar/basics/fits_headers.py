@@ -21,32 +21,43 @@ from hilstar.basics.units import NS_PER_S
 # Seconds, the first that a header has is taken; where a comment names a unit, that counts.
 EXPOSURE_KEYS = (
     *("EXPTIME", "EXPOSURE", "XPOSURE", "TEXPOSUR", "EXP_TIME", "EXP-TIME", "EXPTIME1"),
-    *("EXPOSED", "ITIME", "ONTIME", "ELAPTIME"),
+    *("EXPOSED", "ITIME", "ONTIME", "ELAPTIME", "EXP", "TEXP", "T_EXP", "INTTIME", "INT_TIME"),
+    *("EXPOS", "EXPT", "EXPSEC", "TM-EXPOS", "EXPOSURE TIME", "EXPOSURETIME", "ESO DET DIT"),
 )
 MICROSECOND_KEYS = ("EXPOINUS",)
-MILLISECOND_KEYS = ("EXPMS", "EXPOINMS")
+MILLISECOND_KEYS = ("EXPMS", "EXPOINMS", "EXP_MS", "EXP-MS")
+# What other keywords of an exposure are called; they are named where none that is known is there.
+LIKE_AN_EXPOSURE = re.compile(r".*(?:EXP|INTEGR|SHUT|FRAMETIM)|TELAPSE|LIVETIME|DARKTIME")
 SECONDS_OF_UNIT = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "usec", "microsecond", "microseconds", "\u00b5s"), 1e-6),
+    **dict.fromkeys(("ms", "msec", "msecs", "millisec", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "usec", "usecs", "microsec"), 1e-6),
+    **dict.fromkeys(("microsecond", "microseconds", "\u00b5s"), 1e-6),
     **dict.fromkeys(("min", "minute", "minutes"), 60.0),
 }
 MAX_EXPOSURE_S = 1e6
+MAX_NAMED = 4  # keywords in a note
 SAME_EXPOSURE = 1e-3  # share by which two keywords may differ, as one of them is rounded
 
 START, MIDDLE, END = "start", "middle", "end"
 DATE_KEYS = {
     "DATE-AVG": MIDDLE,
+    "DATE-MID": MIDDLE,
+    "DATE_MID": MIDDLE,
+    "DATEMID": MIDDLE,
     "DATE-BEG": START,
     "DATE-OBS": START,
     "DATE_OBS": START,
     "OBSDATE": START,
+    "OBS-DATE": START,
+    "DATE-STA": START,
+    "DATETIME": START,
     "DATE-END": END,
 }
 # Beside a date without a time; those of UT before those that may be local.
 TIME_KEYS = (
     *("TIME-OBS", "TIME_OBS", "UTC-OBS", "UT-OBS", "UTSTART", "UTCSTART", "UT", "UTC"),
-    *("OBSSTART", "TIME-BEG", "UTC-BEG", "TIME"),
+    *("OBSSTART", "TIME-BEG", "UTC-BEG", "UTC-STA", "UTSHUT", "UTIME", "TIMEOBS", "TIME"),
 )
 MJD_KEYS = {
     "MJD-AVG": MIDDLE,
@@ -55,6 +66,10 @@ MJD_KEYS = {
     "MJD-OBS": START,
     "MJD-END": END,
 }
+# Days of other scales and places, seconds, and dates of which it is not known what they date.
+LIKE_A_TIME = re.compile(r"[HMB]?JD\b.*|JULIAN.*|UNIX.*|GPS.*|.*UTC.*|.*DATE.*")
+# The date of the file, and the one at the observer's clock.
+OTHER_DATES = frozenset({"DATE", "DATE-LOC"})
 NO_DATE = "is no date such as 2024-03-01T20:00:00, and is not used"
 MJD_OF_1970, SECONDS_A_DAY = 40587, 86400
 UTC_NAMES = frozenset({"", "UTC", "UT", "UT1", "GMT", "Z", "ZULU", "UTC(NTP)"})
@@ -73,6 +88,11 @@ OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")  # of the standard before 2000: d
 TIME_OF_DAY = re.compile(r"(\d\d?)[:h ](\d\d?)(?:[:m ](\d\d?(?:\.\d*)?)s?)?")
 LOCAL = re.compile(r"\blocal\b|\bcivil\b", re.IGNORECASE)
 UNIT_IN_COMMENT = re.compile(r"[\[(] *([a-z\u00b5]+) *[\])]|\bin ([a-z]+)\b", re.IGNORECASE)
+# Units that are no other word of a comment, so that they need no brackets.
+PLAIN_UNITS = re.compile(
+    r"\b(ms|us|\u00b5s|[mu]secs?|milli-?sec(?:ond)?s?|micro-?sec(?:ond)?s?)\b",
+    re.IGNORECASE,
+)
 NUMBER_WITH_UNIT = re.compile(r"([-+0-9.eE]+) *([a-z\u00b5]*)", re.IGNORECASE)
 
 PATTERN_KEYS = ("BAYERPAT", "BAYRPAT", "BAYERPATTERN", "CFAPAT", "CFA-PAT", "CFATYPE")
@@ -84,7 +104,11 @@ PATTERNS = frozenset({"RGGB", "BGGR", "GRBG", "GBRG"})
 NO_PATTERN = frozenset(
     {"", "NONE", "NO", "N/A", "MONO", "MONOCHROME", "GREY", "GRAY", "FALSE", "F", "0"}
 )
+# GenICam's names (BayerRG12, SRGGB10) have the first two colours, or all, and the bits.
+SHORT_PATTERNS = {"RG": "RGGB", "BG": "BGGR", "GR": "GRBG", "GB": "GBRG"}
+MAKERS_PATTERN = re.compile(r"(?:BAYER|S)?([RGB]{2,4})\d{0,2}P?")
 OFFSET_KEYS = (("XBAYROFF", "BAYOFFX", "XBAYOFF"), ("YBAYROFF", "BAYOFFY", "YBAYOFF"))
+BINNING_KEYS = ("XBINNING", "YBINNING")
 TOP_DOWN, BOTTOM_UP = "TOP-DOWN", "BOTTOM-UP"
 PATTERN_ADVICE = "write RGGB, BGGR, GRBG or GBRG, or give one colour's pixels as a grey image"
 
@@ -125,12 +149,17 @@ def read_fits_image(data: bytes, size_px: tuple[int, int] | None = None) -> Fits
     t_ns = _middle_ns(header, exposure_s, notes)
     if _row_order(header) == BOTTOM_UP:
         pixels = np.flip(pixels, axis=-2)
-    return FitsImage(pixels, header, exposure_s, t_ns, _bayer(header), tuple(notes))
+    bayer = _bayer(header, notes)
+    binned = [key for key in _stated(header, BINNING_KEYS) if str(header[key]).strip() != "1"]
+    if bayer and binned:
+        mixed = "a binned mosaic may mix colours; give frames that are not binned"
+        notes.append(f"{binned[0]} = {shortened(header[binned[0]])}: {mixed}")
+    return FitsImage(pixels, header, exposure_s, t_ns, bayer, tuple(notes))
 
 
 def _with_inherited(own: Any, primary: Any) -> Any:
     """The header, with those keywords of the primary one that it lacks."""
-    if own is primary or own.get("INHERIT") is False:
+    if own is primary or own.get("INHERIT") in (False, "F"):
         return own
     whole = own.copy()
     for card in primary.cards:
@@ -170,6 +199,14 @@ def _exposure_s(header: Any, notes: list[str]) -> float | None:
         else:
             seconds[key] = value_s
     if not seconds:
+        others = []
+        for card in header.cards:
+            is_number = isinstance(card.value, int | float) and not isinstance(card.value, bool)
+            if is_number and LIKE_AN_EXPOSURE.match(card.keyword):
+                others.append(card.keyword)
+        if others and not notes:
+            named = ", ".join(others[:MAX_NAMED])
+            notes.append(f"{named} is no keyword of an exposure that is known; write EXPTIME, s")
         return None
     first, exposure_s = next(iter(seconds.items()))
     for key, other_s in seconds.items():
@@ -206,7 +243,8 @@ def _unit_of_comment(comment: str) -> float:
         unit_s = SECONDS_OF_UNIT.get((match[1] or match[2]).lower())
         if unit_s is not None:
             return unit_s
-    return 1.0
+    plain = PLAIN_UNITS.search(comment)
+    return 1.0 if plain is None else SECONDS_OF_UNIT[plain[1].lower().replace("-", "")]
 
 
 def _middle_ns(header: Any, exposure_s: float | None, notes: list[str]) -> int | None:
@@ -242,7 +280,23 @@ def _moments(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
     if stated and not moments and not is_explained:
         date = f"{stated[0]} = {shortened(header[stated[0]])}"
         notes.append(f"{date} tells no time of day, nor does another keyword: undated")
+    elif not stated and not moments and not is_explained:
+        _tell_other_times(header, notes)
     yield from moments
+
+
+def _tell_other_times(header: Any, notes: list[str]) -> None:
+    """Name the keywords that look like a time of the exposure, where none that is known is
+    there.
+    """
+    others = []
+    for card in header.cards:
+        has_value = card.value is not None and str(card.value).strip()
+        if has_value and LIKE_A_TIME.fullmatch(card.keyword) and card.keyword not in OTHER_DATES:
+            others.append(card.keyword)
+    if others:
+        named = ", ".join(others[:MAX_NAMED])
+        notes.append(f"{named} is no keyword of a time that is known: undated; write DATE-OBS")
 
 
 def _scale(header: Any) -> str:
@@ -374,7 +428,7 @@ def _row_order(header: Any) -> str:
     return text
 
 
-def _bayer(header: Any) -> str:
+def _bayer(header: Any, notes: list[str]) -> str:
     """The mosaic's pattern from its top left pixel, "" for none. Raises InputError for others.
 
     Of pixel (row, column) the colour is pattern[(row + YBAYROFF) % 2][(column + XBAYROFF) % 2],
@@ -388,6 +442,7 @@ def _bayer(header: Any) -> str:
         for key in _stated(header, VAGUE_PATTERN_KEYS):
             text = str(header[key]).strip().upper()
             pattern = pattern or (text if text in PATTERNS else "")
+    pattern = pattern or _pattern_elsewhere(header, notes)
     if not pattern:
         return ""
     x, y = (_offset(header, keys) for keys in OFFSET_KEYS)
@@ -398,10 +453,26 @@ def _bayer(header: Any) -> str:
     return "".join(letters)
 
 
+def _pattern_elsewhere(header: Any, notes: list[str]) -> str:
+    """The pattern that a keyword of another name has; "" where a known one says that there is
+    none.
+    """
+    if any(_stated(header, PATTERN_KEYS)):
+        return ""
+    for card in header.cards:
+        text = str(card.value).strip().upper()
+        if text in PATTERNS:
+            notes.append(f"{card.keyword} = {text} is taken for the mosaic's pattern")
+            return text
+    return ""
+
+
 def _pattern(key: str, value: Any) -> str:
     text = re.sub(r"[^A-Z0-9/]", "", str(value).upper())
-    if text in PATTERNS:
-        return text
+    maker = MAKERS_PATTERN.fullmatch(text.replace("/", ""))
+    letters = "" if maker is None else SHORT_PATTERNS.get(maker[1], maker[1])
+    if letters in PATTERNS:
+        return letters
     if text not in NO_PATTERN:
         mosaic = f"{key} is {shortened(value)}: a mosaic of a kind that is not read"
         raise InputError(f"{mosaic}; {PATTERN_ADVICE}")

@@ -65,7 +65,20 @@ MAGIC = {
     b"\xff\xfe": "text in UTF-16, not UTF-8",
     b"\xfe\xff": "text in UTF-16, not UTF-8",
 }
-UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# UTF-32's little-endian mark begins as UTF-16's does, so it comes first.
+ENCODING_MARKS = {
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+# How a text of ASCII begins in encodings without a mark: which of each bytes are zeros.
+UNMARKED = {
+    "utf-32-le": re.compile(rb"(?:[^\0]\0{3}){2}"),
+    "utf-32-be": re.compile(rb"(?:\0{3}[^\0]){2}"),
+    "utf-16-le": re.compile(rb"(?:[^\0]\0){4}"),
+    "utf-16-be": re.compile(rb"(?:\0[^\0]){4}"),
+}
 # Bytes that no text in Windows-1252 has: control characters other than tabs, line ends and form
 # feeds, and the five bytes that are no character of it.
 NO_TEXT = re.compile("[\x00-\x08\x0b\x0e-\x1f\x7f\x81\x8d\x8f\x90\x9d]")
@@ -165,10 +178,26 @@ def as_text(path: Path, raw: bytes, advice: str) -> str:
     that is not UTF-8.
     """
     refuse_kind(path, raw[:HEAD_BYTES], advice)
+    wide = wide_encoding(raw[:HEAD_BYTES])
+    if wide is not None:
+        raise cannot_read(path, f"it is text in {wide[:6].upper()}, not UTF-8", advice)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise cannot_read(path, _not_text(io.BytesIO(raw)), advice) from error
+
+
+def wide_encoding(head: bytes) -> str | None:
+    """The UTF-16 or UTF-32 of a text by its first bytes, with or without its mark; None for
+    others.
+    """
+    for mark, encoding in ENCODING_MARKS.items():
+        if head.startswith(mark):
+            return encoding
+    for encoding, beginning in UNMARKED.items():
+        if beginning.match(head):
+            return encoding
+    return None
 
 
 def refuse_kind(path: Path, head: bytes, advice: str) -> None:
@@ -187,7 +216,7 @@ def open_lines(
     """The lines of a text, one after another, so that a large file needs no memory; each ends as in
     the file.
 
-    UTF-8, UTF-16 with its mark, and Windows-1252 with a warning: a line that is no UTF-8.
+    UTF-8, UTF-16 and UTF-32, and Windows-1252 with a warning: a line that is no UTF-8.
     Raises InputError as `read_text` does, for what is no text, and for a line of more than
     MAX_LINE_CHARACTERS: unless `whole_lines`, such a line is given in pieces of that length.
     """
@@ -195,14 +224,15 @@ def open_lines(
         try:
             head = file.read(HEAD_BYTES)
             file.seek(0)
-            encoding = "utf-16" if head.startswith(UTF_16_MARKS) else "utf-8-sig"
-            if encoding == "utf-8-sig":
+            wide = wide_encoding(head)
+            encoding = wide or "utf-8-sig"
+            if wide is None:
                 refuse_kind(path, head, advice)
             text = io.TextIOWrapper(file, encoding=encoding, errors="surrogateescape", newline="")
             yield _bounded(path, text, advice, whole_lines)
         except UnicodeDecodeError as error:
             raise cannot_read(
-                path, "it is cut off or damaged: not UTF-16 to its end", advice
+                path, f"it is cut off or damaged: not {encoding.upper()} to its end", advice
             ) from error
         except OSError as error:
             raise cannot_read(path, error, advice) from error

@@ -3,12 +3,15 @@ r"""Text tables as users have them: one reader for logs, curves, data sheets and
 How a table is read, by its first lines:
 1. The lines between cells are split by comma, tab, semicolon, | or blanks: the one that gives most
    lines as many cells as the header has, with numbers in them.
-2. Lines that begin with #, % or ! are comments, and so is one with ; before its text. Where no
-   line but a comment names the columns, the last comment does.
+2. Lines that begin with #, %, ! or // are comments, and so is one with ; before its text. Where no
+   line but a comment names the columns, the last comment does. Lines of fewer cells above the
+   header are a title.
 3. Below the header may stand a line of units, and a line of dashes (VizieR).
 4. A unit stands in that line, in brackets behind a name, or at its end: `wavelength [nm]`, `t_ms`.
 5. In a table whose cells are split by something other than commas, or quoted, numbers such as
    0,85 have a decimal comma, if none has a point and one cannot be thousands.
+6. A column of times may have dates (ISO 8601, with the day of the month or of the year): they are
+   UTC, unless they state an offset, and read as seconds since 1970.
 
 What was taken and is not plain is said in `notices`. Python's csv module splits the lines.
 """
@@ -17,9 +20,10 @@ import csv
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import date, time, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -29,37 +33,62 @@ from hilstar.basics.reading import open_lines, warn_once
 from hilstar.basics.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 
 VALID = "valid"
-# The names of a column that says which rows hold, and of one that says which do not.
-VALID_NAMES = (
-    VALID,
-    "is_valid",
-    "valid_flag",
-    "validity",
-    "q_valid",
-    "quat_valid",
-    "att_valid",
-    "attitude_valid",
+# A column says which rows hold, or which do not, by one of these words, beside words of what it
+# is about: attitudeValid, is_valid, st_lost. With other words (rate_valid) it is about those.
+VALID_WORDS, INVALID_WORDS = frozenset({"valid", "validity"}), frozenset({"invalid", "lost"})
+SUBJECT_WORDS = frozenset(
+    {
+        *("is", "flag", "q", "quat", "quaternion", "att", "attitude", "orientation", "pose"),
+        *("st", "str", "star", "tracker", "solution", "estimate", "row", "sample", "data"),
+    }
 )
-INVALID_NAMES = ("invalid", "is_invalid", "lost")
+WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^\W\d_]+")
 FLAGS = dict.fromkeys(("", "1", "1.0", "true", "t", "yes", "y", "valid", "ok", "good"), True)
 FLAGS |= dict.fromkeys(("0", "0.0", "false", "f", "no", "n", "invalid", "bad", "lost"), False)
-COMMENTS = ("#", "%", "!")
+# Excel puts quotes around a comment that has a delimiter.
+COMMENTS = ("#", "%", "!", "//", '"#')
+COMMENT_CHARACTERS = frozenset("#%!/")
+# What programs write where there is no number, in small letters.
+NO_NUMBERS = frozenset(
+    {
+        *("", "-", "--", "---", "?", "*", ".", "nan", "-nan", "+nan", "nan(ind)", "-nan(ind)"),
+        *("1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind", "na", "n/a", "#n/a", "<na>", "null"),
+        *("<null>", "(null)", "nil", "none", "nat", "\\n", "missing", "undefined"),
+    }
+)
 DELIMITERS = (",", "\t", ";", "|", " ")
 DELIMITER_NAMES = {",": "commas", "\t": "tabs", ";": "semicolons", "|": "bars |", " ": "blanks"}
 SAMPLE_LINES = 100
 MAX_HEAD_LINES = 20_000  # of comments
 MAX_COLUMNS, MAX_HEADER_CHARACTERS = 1000, 50_000
 MAX_NAMED = 12
+EPOCH_DAY = date(1970, 1, 1)
 CUT = "the last line has no line end, as of a file that was cut off, and is left out"
 CUT += "; end the line where it is whole"
 DOUBTFUL_END = "the last line has no line end, and may be cut off: is the file whole?"
 SHARP_DECIMALS = 12  # of a quaternion or a place: a thousandth of a milliarcsecond
 # Excel's own first line, which names the delimiter.
 EXCEL_MARK = re.compile(r"sep=(.)\s*", re.IGNORECASE)
+# pandas and R write a name that is there twice as NAME.1.
+TWIN = re.compile(r"(.+)\.\d")
+DATE = re.compile(
+    r"(?P<year>\d{4})(?:-(?P<month>\d\d)-(?P<day>\d\d)|[-:/](?P<day_of_year>\d{3}))[T :]"
+    r"(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d)(?P<fraction>\.\d*)?"
+    r" ?(?P<zone>Z|UTC|[-+]\d\d:?\d\d)?",
+    re.ASCII,
+)
+DATE_NAMES = frozenset(
+    {
+        *("t_s", "t", "time", "timestamp", "time_stamp", "date", "datetime", "date_time"),
+        *("utc", "t_utc", "time_utc", "utc_time", "timestamp_utc", "epoch", "epoch_utc"),
+    }
+)
+MAX_TITLE_LINES = 30
 PERCENT_OF = re.compile(r"% ?(?:of )?([^\W\d].*)")
 BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:[,'  ]\d{3})+(?:[.]\d*)?|[-+]?\d{1,3}(?:\.\d{3})+,\d*")
+FORTRAN = re.compile(r"[-+]?\d*\.?\d*[dD][-+]?\d+")
 NOT_SURELY_A_COMMA = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 DASHES = re.compile(r"-{2,}|-?")
 # The unit of hilstar's own columns by the end of their names; the longest end comes first.
@@ -99,13 +128,19 @@ class Chosen(NamedTuple):
     any.
 
     `inverted`: its flags say which rows do not hold. `has_unit` is False where no unit is stated
-    that was wanted.
+    that was wanted. `has_dates`: its cells are dates, whose numbers are seconds since 1970.
     """
 
     place: int
     factor: Decimal | None = None
     inverted: bool = False
     has_unit: bool = True
+    has_dates: bool = False
+
+    @property
+    def is_as_written(self) -> bool:
+        """Whether its cells are the wanted numbers themselves."""
+        return self.factor is None and not self.has_dates
 
 
 @dataclass
@@ -158,11 +193,14 @@ class TextTable:
         previous: list[str] = []
         try:
             for cells in reader:
-                if len(cells) != count or not cells[0] or cells[0][0] in COMMENTS:
+                if len(cells) != count or not cells[0] or cells[0][0] in COMMENT_CHARACTERS:
                     if not any(map(str.strip, cells)) or cells[0].lstrip().startswith(COMMENTS):
                         continue
                     if not self._unended or keep_cut:
                         cells = self._counted(before + reader.line_num, cells)
+                if self._is_header(cells):
+                    again = "the header stands here again, as of files that were joined"
+                    raise self.refusal(before + reader.line_num, f"{again}; delete this line")
                 if self._unended and not self._is_whole(cells, previous):
                     self.is_cut = True
                     if not keep_cut:
@@ -202,6 +240,11 @@ class TextTable:
         number.
         """
         return self._counted(line, split(text, self.delimiter))
+
+    def _is_header(self, cells: list[str]) -> bool:
+        if not self.header or cells[0].strip().strip('"') != self.columns[0].header:
+            return False
+        return [column_of(cell).header for cell in cells] == [each.header for each in self.columns]
 
     def _is_whole(self, cells: list[str], previous: list[str]) -> bool:
         """Whether a row whose line has no end is whole, by its last cell beside those of other
@@ -266,6 +309,9 @@ class TextTable:
             return self._named(self._only(name, exact), by_name, wanted)
         bases = (base, *OTHER_NAMES.get(base, ()), *other_names)
         united, plain = self._united(bases, wanted), self._places(bases)
+        dated = self._dated() if base == "t" and not united else []
+        if dated:
+            return self._of_dates(self._only(name, dated))
         # Where a unit has to be stated, one that states none is another quantity.
         places = set(united)
         if not united or not must_state:
@@ -283,32 +329,74 @@ class TextTable:
     def _named(self, place: int, by_name: str, wanted: str) -> Chosen:
         """A column of hilstar's own name, whose unit `by_name` a bracket may only repeat."""
         column = self.columns[place]
+        if by_name == "s" and self._has_dates(place):
+            return self._of_dates(place)
         if column.unit and by_name and factor(column.unit, by_name) != 1:
             raise self.refusal(self.header_line, f"column {column.header} states two units")
         return self._in_unit(place, column.unit or wanted, wanted)
 
     def _no_unit(self, place: int, name: str, wanted: str) -> InputError:
         column = self.columns[place]
+        where = f"{self.path}:{self.header_line}: column {column.header}"
+        cell = self.first_cell(place)
+        if cell and not is_number(cell) and not is_no_number(cell):
+            kind = f"no number {wanted}"
+            if wanted == "s":
+                kind = "no time: write seconds, or dates such as 2024-01-31T06:00:00.000Z"
+            return InputError(f"{where} has {shortened(cell, 40)!r}, which is {kind}")
         advice = f"write {name}, or its unit as {column.name} [{wanted}]"
-        where = f"{self.path}:{self.header_line}"
-        return InputError(f"{where}: column {column.header} has no unit; {advice}")
+        return InputError(f"{where} has no unit; {advice}")
 
     def valid(self) -> Chosen | None:
         """The column that says which rows hold, or which do not, by any of its names, if there is
         one.
         """
-        places = self._places(VALID_NAMES)
+        places = self._about(True)
         if places:
             return Chosen(self._only(VALID, places))
-        places = self._places(INVALID_NAMES)
+        places = self._about(False)
         return Chosen(self._only("invalid", places), inverted=True) if places else None
 
     def _places(self, names: Sequence[str]) -> list[int]:
         places = []
         for place, column in enumerate(self.columns):
-            if plain_name(column.name) in names:
+            twin = TWIN.fullmatch(column.name)
+            is_twin = twin is not None and plain_name(twin[1]) in names
+            if is_twin or plain_name(column.name) in names:
                 places.append(place)
         return places
+
+    def _about(self, holds: bool) -> list[int]:
+        """The places of the columns whose flags say which rows hold, or which do not."""
+        places = []
+        for place, column in enumerate(self.columns):
+            if validity_of_name(column.name) is holds:
+                places.append(place)
+        return places
+
+    def _dated(self) -> list[int]:
+        places = []
+        for place, column in enumerate(self.columns):
+            name = re.sub(r"\W+", "_", column.name.casefold()).strip("_")
+            if name in DATE_NAMES and self._has_dates(place):
+                places.append(place)
+        return places
+
+    def _has_dates(self, place: int) -> bool:
+        return DATE.fullmatch(self.first_cell(place)) is not None
+
+    def first_cell(self, place: int) -> str:
+        """The first cell of a column that is not blank, among the first rows; "" for none."""
+        for row in self.sample:
+            if len(row) > place and row[place] and not row[0].startswith(COMMENTS):
+                return row[place]
+        return ""
+
+    def _of_dates(self, place: int) -> Chosen:
+        header = self.columns[place].header
+        since = "in UTC where they state no offset, and read as seconds since 1970"
+        self.notices.append(f"column {header} has dates, {since}")
+        return Chosen(place, has_dates=True)
 
     def _united(self, bases: Sequence[str], wanted: str) -> dict[int, str]:
         """The unit by place of the columns named like one of `bases` with a unit of the wanted
@@ -357,7 +445,9 @@ class TextTable:
             text = ascii_text(text)
         if self.decimal_comma and DECIMAL_COMMA.fullmatch(text):
             text = text.replace(",", ".")
-        if chosen.factor is not None:
+        if chosen.has_dates:
+            text = seconds_of_date(text)
+        elif chosen.factor is not None:
             text = _scaled(text, chosen.factor)
         if chosen.inverted and text.lower() in FLAGS:
             text = str(int(not FLAGS[text.lower()])) if text else ""
@@ -387,6 +477,55 @@ def quantity_of(name: str) -> tuple[str, str]:
 
 def _decimals(text: str) -> int:
     return len(text.replace(",", ".").partition(".")[2])
+
+
+def name_words(text: str) -> frozenset[str]:
+    """The words of a name in small letters: AttitudeValid and attitude_valid have the same."""
+    return frozenset(word.casefold() for word in WORD.findall(text))
+
+
+def validity_of_name(name: str) -> bool | None:
+    """Whether flags of that name say what holds (True) or what does not; None for other names."""
+    words = name_words(name)
+    for known, holds in ((VALID_WORDS, True), (INVALID_WORDS, False)):
+        if words & known and words - known <= SUBJECT_WORDS:
+            return holds
+    return None
+
+
+def is_no_number(text: str) -> bool:
+    """Whether a cell says that there is no number."""
+    return text.strip().casefold() in NO_NUMBERS
+
+
+def seconds_of_date(text: str) -> str:
+    """A date's seconds since 1970, in days of 86400 s, every digit of them; another text as it
+    is.
+    """
+    match = DATE.fullmatch(text)
+    if match is None:
+        return text
+    try:
+        day = date(int(match["year"]), int(match["month"] or 1), int(match["day"] or 1))
+        day += timedelta(days=int(match["day_of_year"] or 1) - 1)
+        clock = time(int(match["hour"]), int(match["minute"]), int(match["second"]))
+    except ValueError:
+        return text  # its reader refuses it as it stands
+    if day.year != int(match["year"]):
+        return text
+    seconds = (day - EPOCH_DAY).days * 86400 + clock.hour * 3600
+    seconds += clock.minute * 60 + clock.second - _ahead_s(match["zone"] or "Z")
+    whole = Decimal(seconds)
+    return str(whole + Decimal(match["fraction"] or 0)) if match["fraction"] != "." else str(whole)
+
+
+def _ahead_s(zone: str) -> int:
+    """How far a clock with this offset is ahead of UTC."""
+    if zone[0] not in "+-":
+        return 0
+    digits = zone[1:].replace(":", "")
+    ahead_s = int(digits[:2]) * 3600 + int(digits[2:]) * 60
+    return -ahead_s if zone[0] == "-" else ahead_s
 
 
 def plain_name(text: str) -> str:
@@ -443,12 +582,17 @@ def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
     `advice`.
     """
     comments, sample, number, delimiter = _head(path, advice, lines)
+    title = _title_lines(sample)
+    number, sample = number + title, sample[title:]
     following = itertools.chain(sample, lines)
     if not sample:
         return TextTable(path, advice, [], ",", number, following, header=False)
     delimiter = delimiter or delimiter_of(sample)
     header = split(sample[0], delimiter)
     table = TextTable(path, advice, [], delimiter, number, following, header_line=number)
+    if title:
+        above = "line above the header is" if title == 1 else f"{title} lines above the header are"
+        table.notices.append(f"the {above} taken for a title")
     if len(sample[0]) > MAX_HEADER_CHARACTERS:
         reason = f"its first line is longer than {MAX_HEADER_CHARACTERS} characters"
         raise table.refusal(number, reason)
@@ -476,7 +620,46 @@ def _name_by_header(
     if not header[-1].strip() and rows and len(rows[0]) == len(header) - 1:
         del header[-1]  # a delimiter at the end of the header alone
     table.columns = [column_of(name) for name in header]
+    if _are_numbered(rows, len(header)):
+        table.columns.insert(0, Column("", ""))
+        beginning = "each row begins with its number, for which the header has no name"
+        table.notices.append(beginning)
     table.first_row += 1 + _skip_units(table, rows, following)
+
+
+def _are_numbered(rows: Sequence[list[str]], count: int) -> bool:
+    """Whether rows have a cell more than the header, before its first: R writes their numbers."""
+    whole = [row for row in rows[:-1] if any(row)]
+    if len(whole) < 2 or any(len(row) != count + 1 or not row[-1] for row in whole):
+        return False
+    numbers = [row[0] for row in whole]
+    first = int(numbers[0]) if numbers[0].isdecimal() else -1
+    return first in (0, 1) and numbers == [str(first + k) for k in range(len(numbers))]
+
+
+def _title_lines(sample: Sequence[str]) -> int:
+    """How many lines stand above the header, which has as many cells as the first row: one of
+    numbers alone or, where no row is, one with a number.
+    """
+    return _lines_above(sample, all) or _lines_above(sample, any)
+
+
+def _lines_above(sample: Sequence[str], which: Callable[[Iterable[bool]], bool]) -> int:
+    for place, line in enumerate(sample[:MAX_TITLE_LINES]):
+        if not line.strip() or _is_comment(line):
+            continue
+        delimiter = delimiter_of(sample[place:])
+        row = split(line, delimiter)
+        numbers = [is_number(cell) or (which is all and is_no_number(cell)) for cell in row]
+        if len(row) < 2 or not which(numbers):
+            continue
+        for above, text in enumerate(sample[:place]):
+            cells = split(text, delimiter)
+            is_header = len(cells) == len(row) and not any(map(is_number, cells))
+            if is_header and not _is_comment(text):
+                return above
+        return 0
+    return 0
 
 
 class Head(NamedTuple):
@@ -554,7 +737,7 @@ def _name_by_comment(table: TextTable, comments: Sequence[str], count: int) -> N
     """
     table.header = False
     table.columns = [Column("", "")] * count
-    text = comments[-1].strip().lstrip("#%!;").strip() if comments else ""
+    text = comments[-1].strip().lstrip('#%!;/"').strip() if comments else ""
     for delimiter in dict.fromkeys((table.delimiter, ",", " ")):
         names = split(text, delimiter) if text else []
         if len(names) == count and not any(map(is_number, names)):
@@ -592,8 +775,10 @@ def _is_units(cells: Sequence[str], count: int) -> bool:
     """Whether each cell that is not blank is a unit, and none a number."""
     if len(cells) != count:
         return False
-    units = [cell.strip("[]() ") for cell in cells if cell]
-    if not units or any(map(is_number, units)):
+    if any(map(is_number, cells)):
+        return False
+    units = list(filter(None, (cell.strip("[]() ") for cell in cells)))
+    if not units:
         return False
     return all(map(is_unit, map(plain_unit, units)))
 
@@ -665,6 +850,8 @@ def number_fault(text: str) -> str:
     """What a cell is that is no finite number, as far as its form says it; "" elsewhere."""
     if DECIMAL_COMMA.fullmatch(text) and not NOT_SURELY_A_COMMA.fullmatch(text):
         return " (a decimal comma: write a point)"
+    if FORTRAN.fullmatch(text):
+        return " (an exponent of D: write E)"
     if THOUSANDS.fullmatch(text):
         return " (thousands apart: write 1234.5)"
     return ""

@@ -21,7 +21,10 @@ STRAIGHT = "straight"
 NO_SERIALS = frozenset({0, 1})
 DIGITS_IN_A_ROW = ("01234567890", "12345678901234567890", "9876543210")
 LETTERS_IN_A_ROW = ("abcdefghijklmnopqrstuvwxyz", "0123456789abcdef")
-SAMPLE_NUMBERS = frozenset({0xDEADBEEF, 0x12345678})
+SAMPLE_NUMBERS = frozenset({0xDEADBEEF, 0xBAADF00D, 0xCAFEBABE, 0x12345678})
+# What stands before a number, and says nothing of it.
+LABEL = re.compile(r"(?:serial|sn|no|number|nr)+(?=\d)")
+ONE_BYTE = re.compile(r"(..)\1{3,}")  # written as text: 01010101 and longer
 MIN_IN_A_ROW = 4  # characters: fewer are a count
 SERIAL_BYTES = 4  # of the number in an EDID's head
 NO_SERIAL_WORDS = frozenset(
@@ -42,6 +45,8 @@ NO_SERIAL_WORDS = frozenset(
         *("system", "string", "default", "value"),
         *("serial", "serialno", "serialnumber", "sn", "number", "monitor", "display"),
         *("demo", "demoset", "sample", "test", "dummy", "tobefilledbyoem"),
+        *("prototype", "engsample", "generic", "panel", "lcd", "hdmi"),
+        "linux",  # of the EDIDs that the kernel has built in: "Linux #0"
         *("notavailable", "notapplicable", "notspecified", "notset"),
     }
 )
@@ -139,12 +144,14 @@ def _stated_serial(text: str) -> str:
     """The serial number that a text holds; "" where it is a placeholder, which each monitor of
     its kind has.
     """
-    plain = "".join(character for character in text.casefold() if character.isalnum())
+    alphanumeric = "".join(character for character in text.casefold() if character.isalnum())
+    plain = LABEL.sub("", alphanumeric)
     is_placeholder = _is_placeholder_number(plain) or _is_placeholder_word(text, plain)
     if len(plain) >= MIN_IN_A_ROW:
         is_one_character = len(set(plain)) == 1
         is_row = any(plain in row for row in (*DIGITS_IN_A_ROW, *LETTERS_IN_A_ROW))
-        is_placeholder = is_placeholder or is_one_character or is_row
+        is_one_byte = ONE_BYTE.fullmatch(plain) is not None
+        is_placeholder = is_placeholder or is_one_character or is_row or is_one_byte
     return "" if is_placeholder else text
 
 
@@ -170,7 +177,7 @@ def _is_placeholder_word(text: str, plain: str) -> bool:
     letters = "".join(character for character in plain if not character.isdigit())
     if not plain or letters in NO_SERIAL_WORDS:
         return True
-    parts = set(re.findall(r"[a-z]+|[0-9]+", text.casefold()))
+    parts = set(re.findall(r"[a-z]+|[0-9]+", LABEL.sub("", text.casefold())))
     return bool(parts) and parts <= NO_SERIAL_WORDS
 
 

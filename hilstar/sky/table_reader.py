@@ -27,13 +27,13 @@ from hilstar.basics.errors import InputError, cannot_read, shortened
 from hilstar.basics.image_files import ImageSizeError, is_fits, unpacked
 from hilstar.basics.reading import (
     HEAD_BYTES,
-    UTF_16_MARKS,
     kind_of,
     open_regular,
     read_bytes,
     size_text,
+    wide_encoding,
 )
-from hilstar.basics.text_tables import TextTable, open_table
+from hilstar.basics.text_tables import NO_NUMBERS, TextTable, open_table
 from hilstar.basics.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 from hilstar.sky.catalog import load_catalog
 
@@ -153,7 +153,10 @@ MAX_XML_BYTES = 500_000_000  # a VOTable is parsed as a whole
 MAX_HEAD_BYTES = 1_000_000  # lines before a text's rows
 MAX_ROWS = 10_000_000
 CHUNK_BYTES = 64_000_000  # parsed at once
-BLANKS = ("", "null", "NULL", "nan", "NaN", "--", "---")
+# Astropy compares them letter by letter.
+BLANKS = sorted(
+    {"NaN", "NaT"}.union(NO_NUMBERS, map(str.upper, NO_NUMBERS), map(str.capitalize, NO_NUMBERS))
+)
 UNIT_SEPARATOR = "\x1f"
 ELSEWHERE = re.compile(rb"<STREAM\b[^>]*\bhref\s*=", re.IGNORECASE)
 
@@ -383,7 +386,7 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
     kind = kind_of(head[:HEAD_BYTES])
     if kind == "a gzip file" and is_fits(packed := read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)):
         return _read_packed_fits(path, packed, roles)
-    if kind is not None and kind != "a FITS file" and not head.startswith(UTF_16_MARKS):
+    if kind is not None and kind != "a FITS file" and wide_encoding(head) is None:
         raise cannot_read(
             path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED
         )

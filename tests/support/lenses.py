@@ -4,6 +4,8 @@ law in vectors.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 # Sellmeier's coefficients by Schott's data sheets.
@@ -14,6 +16,13 @@ SCHOTT = {
 }
 # A cemented doublet of 100.031 mm, Edmund's 32-327: radius, thickness, glass.
 DOUBLET = ((61.47, 6.0, "N-BK7"), (-44.64, 2.5, "N-SF5"), (-129.94, 95.952, ""))
+
+
+def in_place_of(usual: list[str], lines: Iterable[str]) -> list[str]:
+    """Usual lines, but for those whose keyword one of `lines` has, and then these."""
+    lines = list(lines)
+    keywords = {line.split()[0] for line in lines}
+    return [line for line in usual if line.split()[0] not in keywords] + lines
 
 
 def zmx(
@@ -29,21 +38,17 @@ def zmx(
     surfaces by their numbers.
     """
     head = system or (f"ENPD {20 / mm}",)
-    lines = [
-        "VERS 140124 258 36214",
-        "MODE SEQ",
-        f"UNIT {unit} X W X CM MR CPMM",
-        *head,
-        "ENVD 20 1 0",
-        "GCAT SCHOTT",
-    ]
-    lines += ["FTYP 0 0 2 1 0 0 0", "XFLN 0 0", "YFLN 0 1", "WAVM 1 0.5875618 1", "PWAV 1"]
+    usual = ["VERS 140124 258 36214", "MODE SEQ", f"UNIT {unit} X W X CM MR CPMM", "ENVD 20 1 0"]
+    usual += ["GCAT SCHOTT", "FTYP 0 0 2 1 0 0 0", "XFLN 0 0", "YFLN 0 1"]
+    usual += ["WAVM 1 0.5875618 1", "PWAV 1"]
+    lines = in_place_of(usual, head)
     lines += ["SURF 0", "  TYPE STANDARD", '  CURV 0 0 0 0 0 ""', f"  DISZ {far}"]
     for number, (radius, thickness, glass) in enumerate(surfaces, 1):
-        lines += [f"SURF {number}", *(["  STOP"] if number == 1 else []), "  TYPE STANDARD"]
-        lines += [f'  CURV {mm / radius!r} 0 0 0 0 ""', f"  DISZ {thickness / mm!r}"]
-        lines += [f"  GLAS {glass} 0 0 1.5 40 0 0 0 0 0 0"] if glass else []
-        lines += (more or {}).get(number, [])
+        usual = ["  STOP"] if number == 1 else []
+        usual += ["  TYPE STANDARD", f'  CURV {mm / radius!r} 0 0 0 0 ""']
+        usual += [f"  DISZ {thickness / mm!r}"]
+        usual += [f"  GLAS {glass} 0 0 1.5 40 0 0 0 0 0 0"] if glass else []
+        lines += [f"SURF {number}", *in_place_of(usual, (more or {}).get(number, []))]
     lines += [
         f"SURF {len(surfaces) + 1}",
         "  TYPE STANDARD",

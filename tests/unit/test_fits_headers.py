@@ -69,6 +69,14 @@ def read(cards: dict, pattern: str = "RGGB"):
         ({"EXPTIME": (250000, "[us]")}, 0.25),
         ({"EXPTIME": (10.0, "[s] time in seconds")}, 10.0),
         ({"EXPTIME": (10.0, "Exposure time")}, 10.0),
+        ({"EXPTIME": (250.0, "milliseconds")}, 0.25),
+        ({"EXPTIME": (250.0, "duration, msec")}, 0.25),
+        ({"EXPTIME": (250000, "Exposure time in microsec")}, 0.25),
+        ({"EXPTIME": (10.0, "of the minimum, sec")}, 10.0),
+        ({"EXP_MS": 250.0}, 0.25),
+        ({"TEXP": 10.0}, 10.0),
+        ({"HIERARCH EXPOSURE TIME": 10.0}, 10.0),
+        ({"HIERARCH ESO DET DIT": 10.0}, 10.0),
         ({"EXPTIME": (10.0, "in total")}, 10.0),
         ({"EXPOINUS": 250000}, 0.25),
         ({"EXPTIME": 0.25, "EXPOINUS": 250000}, 0.25),
@@ -87,6 +95,15 @@ def test_an_exposure_that_is_none_is_said(value):
     found = read({"EXPTIME": value})
     assert found.exposure_s is None
     assert "EXPTIME" in found.notes[0] and "no exposure in seconds" in found.notes[0]
+
+
+@pytest.mark.parametrize("key", ["SHUTTER", "EXPDUR", "TELAPSE", "FRAMETIM", "HIERARCH ESO EXPT"])
+def test_a_keyword_that_may_be_an_exposure_is_named(key):
+    found = read({key: 10.0})
+    assert found.exposure_s is None
+    name = key.removeprefix("HIERARCH ")
+    assert f"{name} is no keyword of an exposure that is known" in found.notes[0]
+    assert not read({key: "open"}).notes
 
 
 def test_two_exposures_that_differ_are_said():
@@ -127,6 +144,10 @@ def astropy_ns(text: str, scale: str) -> int:
         ({"MJD-END": 60370.5}, "2024-03-01T11:59:55"),
         ({"DATE-OBS": "01/03/99", "TIME-OBS": "20:00:00"}, "1999-03-01T20:00:05"),
         ({"DATE-OBS": EIGHT_PM, "TIMESYS": "UTC"}, "2024-03-01T20:00:05"),
+        ({"DATE-MID": EIGHT_PM}, "2024-03-01T20:00:00"),
+        ({"OBS-DATE": EIGHT_PM}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "UTSHUT": "20:00:00"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "TIMEOBS": "20:00:00"}, "2024-03-01T20:00:05"),
     ],
 )
 def test_a_time_is_the_middle_of_the_exposure(cards, expected):
@@ -193,9 +214,50 @@ def test_what_contradicts_or_is_assumed_is_said():
 
 
 @pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("JD", 2460371.3333333),
+        ("MJD", 60370.5),
+        ("UNIXTIME", 1709323200.0),
+        ("UTC", EIGHT_PM),
+        ("GPS_UTC", EIGHT_PM),
+    ],
+)
+def test_a_keyword_that_may_be_a_time_is_named(key, value):
+    found = read({key: value, "EXPTIME": 10.0})
+    assert found.t_ns is None
+    assert found.notes == (f"{key} is no keyword of a time that is known: undated; write DATE-OBS",)
+
+
+@pytest.mark.parametrize("key", ["DATE", "DATE-LOC"])
+def test_the_date_of_the_file_or_of_another_clock_is_no_time(key):
+    found = read({key: EIGHT_PM, "EXPTIME": 10.0})
+    assert found.t_ns is None and not found.notes
+
+
+@pytest.mark.parametrize("key", ["CFA_PATT", "BAYERIND", "MOSAIC", "COLORMOD"])
+def test_a_pattern_in_a_keyword_that_is_not_known_is_taken_and_said(key):
+    found = read({key: "gbrg"})
+    assert found.bayer == "GBRG"
+    assert found.notes == (f"{key} = GBRG is taken for the mosaic's pattern",)
+    assert read({key: "gbrg", "BAYERPAT": "NONE"}).bayer == ""
+
+
+def test_a_binned_mosaic_is_said():
+    binned = read({"BAYERPAT": "RGGB", "XBINNING": 2, "YBINNING": 2})
+    assert binned.notes[0].startswith("XBINNING = 2: a binned mosaic may mix colours")
+    assert not read({"BAYERPAT": "RGGB", "XBINNING": 1}).notes
+    assert not read({"XBINNING": 2}).notes
+
+
+@pytest.mark.parametrize(
     ("pixels", "cards"),
     [
         ("RGGB", {"BAYERPAT": "RGGB"}),
+        ("RGGB", {"BAYERPAT": "RG/GB"}),
+        ("RGGB", {"BAYERPAT": "BayerRG12"}),
+        ("GBRG", {"BAYERPAT": "SGBRG10P"}),
+        ("GRBG", {"BAYERPAT": "GRBG_16"}),
         ("RGGB", {"BAYERPAT": "rggb"}),
         ("RGGB", {"BAYERPAT": "'RGGB'"}),
         ("RGGB", {"COLORTYP": "RGGB"}),

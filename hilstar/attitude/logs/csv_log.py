@@ -24,9 +24,12 @@ from hilstar.attitude.wire.source import HILSTARS
 from hilstar.basics.errors import InputError
 from hilstar.basics.text_tables import (
     CUT,
+    FLAGS,
     Chosen,
     TextTable,
+    is_no_number,
     is_valid,
+    name_words,
     number_fault,
     open_table,
     plain_name,
@@ -46,7 +49,6 @@ MARKS = frozenset(
     [
         "status",
         "quality",
-        "quality_flag",
         "flag",
         "flags",
         "state",
@@ -56,6 +58,8 @@ MARKS = frozenset(
         "tracking",
     ],
 )
+# Words that mark rows where the column has flags, and are about something else where it has not.
+FLAG_WORDS = frozenset({"ok", "good", "bad", "valid", "error", "err", "fault", "lost", "converged"})
 # Names that other programs give to angular rates. Whose axes and sign they have is not known, so
 # they are not taken for hilstar's; nor are they passed over without a word.
 RATES_OF_OTHERS = re.compile(
@@ -96,8 +100,9 @@ class CsvLog:
         if not table.columns:
             return
         table.advice = f"write finite numbers for {','.join(CSV_COLUMNS)}"
+        of_the_head = list(table.notices)
         has_rates = any(table.chosen(name, RATE_UNIT) for name in RATE_COLUMNS)
-        table.notices.clear()
+        table.notices[:] = of_the_head  # what is chosen is told when it is taken
         names = CSV_COLUMNS + (RATE_COLUMNS if has_rates else ())
         self._t, *numbers = [self._needed(name, names) for name in CSV_COLUMNS]
         # Whatever the columns are called: a table that says so by its names needs no statement.
@@ -128,11 +133,19 @@ class CsvLog:
         return chosen
 
     def _tell_marks(self) -> None:
-        marks = [column.header for column in self.table.columns if plain_name(column.name) in MARKS]
+        marks = []
+        for place, column in enumerate(self.table.columns):
+            words = name_words(column.name)
+            if words & MARKS or (words & FLAG_WORDS and self._has_flags(place)):
+                marks.append(column.header)
         if marks and self._valid is None:
             named = ", ".join(marks)
             rows = f"column {named} is not used: rows of every value of it are shown"
             self.told.append((TABLE_KIND, f"{rows}; name it valid, 1 or 0"))
+
+    def _has_flags(self, place: int) -> bool:
+        cells = [row[place].lower() for row in self.table.sample if len(row) > place]
+        return bool(cells) and all(cell in FLAGS for cell in cells)
 
     def _tell_rates(self) -> None:
         headers = [
@@ -176,7 +189,7 @@ class CsvLog:
         columns = [self._t, *self._q, *self._rates]
         if self.table.decimal_comma:
             return columns
-        return [column for column in columns if column.factor is not None]
+        return [column for column in columns if not column.is_as_written]
 
     def _converted(self, cells: list[str], columns: Sequence[Chosen]) -> list[str]:
         cells = cells.copy()
@@ -189,8 +202,9 @@ class CsvLog:
             return self._sample(cells)
         except (ValueError, LookupError, ArithmeticError):
             pass
-        if not any(cells[column.place].strip() for column in self._q):
-            # An estimator that has not begun writes nothing, as another writes NaN.
+        texts = [cells[column.place] for column in self._q]
+        if all(map(is_no_number, texts)) and texts != ["nan"] * len(texts):
+            # An estimator that has not begun writes nothing, or a word, as another writes NaN.
             return self._event(self._without_quaternion(cells))
         row = self.table.delimiter.join(cells)
         if not row.isascii():  # a minus or a blank of typesetters
@@ -213,6 +227,8 @@ class CsvLog:
         """The attitude of a row, as sent. Raises ValueError, LookupError or ArithmeticError."""
         t_ns = ns_of_seconds(cells[self._t.place])
         w, x, y, z = (cells[column.place] for column in self._q)
+        if "_" in w + x + y + z:
+            raise ValueError
         q = float(w), float(x), float(y), float(z)
         rate = None
         if self._rates:

@@ -7,6 +7,7 @@ The objects stand one a line (JSON lines), over several lines, or in one array, 
 import contextlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -30,9 +31,11 @@ from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Event, Refusal, decode
 from hilstar.basics.errors import shortened
 from hilstar.basics.reading import open_lines
+from hilstar.basics.text_tables import validity_of_name
 
 JSON_KEYS = ('"t_ns"', '"q"', '"rate"', '"sequence"', '"discontinuity"')
-VALID_KEY = '"valid"'
+# Of a key that may say whether an attitude holds, by the words of text tables.
+VALIDITY_WORD = re.compile(r"valid|lost", re.IGNORECASE)
 VALIDITY = {"true": True, "1": True, "false": False, "0": False}
 # An array or an object that begins; "[time]" would be a heading of a table.
 ARRAY_BEGINS = re.compile(r"\[(?:\{|\[|\]|$)")
@@ -67,7 +70,10 @@ def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterato
         event: Event = _json_fault(text) or decode(text.encode())
         if not isinstance(event, AttitudeSample | Refusal):
             event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
-        if VALID_KEY in text:
+        if isinstance(event, Refusal) and "null" in text and _has_no_quaternion(text):
+            # What has no number of JSON is null, as pandas writes NaN.
+            event = replace(event, unset=True)
+        if VALIDITY_WORD.search(text):
             validity = _validity(text)
             if validity is False:
                 invalid += 1
@@ -183,13 +189,28 @@ def _validity(text: str) -> bool | Refusal:
     string.
     """
     try:
-        stated = msgspec.json.decode(text, type=dict[str, object]).get("valid", True)
+        keys = msgspec.json.decode(text, type=dict[str, object])
     except msgspec.MsgspecError:
         return True  # refused by `decode`
-    word = str(stated).lower()
-    if word not in VALIDITY:
-        return Refusal("format", f"valid is {shortened(stated)!r}; write true or false")
-    return VALIDITY[word]
+    holds = True
+    for key, stated in keys.items():
+        meaning = validity_of_name(key)
+        if meaning is None:
+            continue
+        word = str(stated).lower()
+        if word not in VALIDITY:
+            return Refusal("format", f"{key} is {shortened(stated)!r}; write true or false")
+        holds = holds and VALIDITY[word] == meaning
+    return holds
+
+
+def _has_no_quaternion(text: str) -> bool:
+    """Whether an object has null in place of its quaternion, or of each of its numbers."""
+    try:
+        q = msgspec.json.decode(text, type=dict[str, object]).get("q", 0)
+    except msgspec.MsgspecError:
+        return False
+    return q in (None, [None] * 4)
 
 
 def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:

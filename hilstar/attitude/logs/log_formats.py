@@ -49,7 +49,7 @@ class LogHead(NamedTuple):
         with open_lines(self.path, readable(), MAX_LOG_BYTES, whole_lines=False) as lines:
             for line in lines:
                 words = line.split(maxsplit=1)
-                if words and words[0] != "COMMENT" and not words[0].startswith("#"):
+                if words and words[0] != "COMMENT" and not words[0].startswith(("#", "//")):
                     return words[0]
         return ""
 

@@ -147,6 +147,8 @@ def ns_of_seconds(seconds: str) -> int:
     Raises ValueError or ArithmeticError.
     """
     value = Decimal(seconds)
+    if "_" in seconds:  # Python alone reads 1_000
+        raise ValueError
     if not value.is_finite() or value.adjusted() > 40:
         raise ValueError
     return int(value.scaleb(9).to_integral_value())

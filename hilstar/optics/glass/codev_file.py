@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, shortened
 from hilstar.optics.glass.lens_data import (
+    MAX_INDEX,
     NEAR_OBJECT,
     Aperture,
     FieldKind,
@@ -27,7 +28,9 @@ from hilstar.optics.glass.lens_data import (
     LensSurface,
     PupilKind,
     Shape,
+    add_once,
     glass_of_code,
+    lens_text,
     nth,
     only_aperture,
 )
@@ -133,10 +136,9 @@ def _statements(data: bytes) -> Iterator[LensLine]:
 
     `;` ends one, `&` at a line's end goes on, `!` begins a comment; quoted words are whole.
     """
-    text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     before = ""
     start = 0
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(lens_text(data).splitlines(), 1):
         start = start if before else number
         whole = before + _without_comment(line)
         if whole.rstrip().endswith("&"):
@@ -183,7 +185,7 @@ class _Reader(LensFileReader):
         elif line.keyword in SURFACES:
             self.surfaces.append(_Surface(len(self.surfaces), line))
         elif line.keyword in ONCE or line.keyword in FIELDS:
-            self.system[line.keyword] = line
+            add_once(self.system, line)
         elif not self._is_ignored(line):
             self._take_of_surface(line)
 
@@ -213,7 +215,10 @@ class _Reader(LensFileReader):
         if line.keyword in SHAPES:
             surface.apertures.append(line)
         elif line.keyword in VALUES | MARKS and is_plain:
-            surface.values[line.keyword] = line
+            if len(line.words) > 1 and line.keyword in VALUES:
+                more = shortened(" ".join(line.words[1:]))
+                line.refuse(f"at {surface.label} has {more} behind it", "put ; between commands")
+            add_once(surface.values, line, f"at {surface.label} ")
         else:
             line.refuse(f"at {surface.label} is not known", ADVICE)
 
@@ -411,7 +416,7 @@ class _Reader(LensFileReader):
                 f"at {surface.label} has the glass {index}:{abbe}",
                 "write n:V, such as 1.5168:64.17",
             )
-        if index_d < 1 or abbe_d < 0:
+        if not 1 <= index_d <= MAX_INDEX or abbe_d < 0:
             surface.line.refuse(
                 f"at {surface.label} has the glass {index}:{abbe}",
                 "write n:V, such as 1.5168:64.17",

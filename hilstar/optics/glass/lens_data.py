@@ -3,6 +3,7 @@
 Readers of formats (`zemax_file.py`, `codev_file.py`) make one; `optiland_lens.py` traces it.
 """
 
+import codecs
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,9 +15,13 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
+from hilstar.basics.reading import HEAD_BYTES, wide_encoding
 
 # Lens units: an object this far is at infinity (OpticStudio's rule; CODE V writes 1e11 and more).
 MIN_INFINITE = 1e10
+# Of light that glass or a mirror passes on to a detector: what is beyond is in another unit.
+MIN_WAVE_UM, MAX_WAVE_UM = 0.1, 30.0
+MAX_INDEX = 6.0  # germanium's 4 is the largest of a lens
 LINES_UM = {"d": 0.5875618, "F": 0.4861327, "C": 0.6562725, "g": 0.4358343}
 # Schott's normal line: the partial dispersion P_g,F of glasses without anomalous dispersion
 # (TIE-29).
@@ -32,6 +37,14 @@ Shape = Literal["circle", "rectangle", "ellipse", "spider"]
 def nth(values: Sequence[float], number: int) -> float:
     """A value of a list that may end earlier; 0 behind its end."""
     return values[number] if number < len(values) else 0.0
+
+
+def lens_text(data: bytes) -> str:
+    """The text of a lens file's bytes: UTF-16 as OpticStudio writes it, or any of one byte."""
+    wide = wide_encoding(data[:HEAD_BYTES])
+    if wide is not None:
+        return data.decode(wide, errors="replace").removeprefix("\ufeff")
+    return data.removeprefix(codecs.BOM_UTF8).decode("latin-1")
 
 
 class LensLine:
@@ -64,6 +77,10 @@ class LensLine:
             return math.inf
         value = self.value(place)
         return math.inf if abs(value) >= MIN_INFINITE else value
+
+    def same_as(self, other: "LensLine | None") -> bool:
+        """Whether another line, if there is one, says the same."""
+        return other is None or other.words == self.words
 
     def numbers(self) -> tuple[float, ...]:
         """All its words as numbers. Raises InputError."""
@@ -257,6 +274,12 @@ class LensPrescription:
             raise InputError("it has no surfaces between object and image; write the lens's")
         if not self.wavelengths_um or min(self.wavelengths_um) <= 0:
             raise InputError("it has no wavelength above 0; write those of its light")
+        for wave_um in self.wavelengths_um:
+            if not MIN_WAVE_UM <= wave_um <= MAX_WAVE_UM:
+                known = f"write {MIN_WAVE_UM:g} to {MAX_WAVE_UM:g} um (WAVM), in nm (WL)"
+                raise InputError(
+                    f"its wavelength is {wave_um:g} um: is it in another unit? {known}"
+                )
         if not 0 <= self.primary < len(self.wavelengths_um):
             count = len(self.wavelengths_um)
             raise InputError(f"its primary wavelength is number {self.primary + 1} of {count}")
@@ -347,6 +370,15 @@ def only_aperture(statements: Mapping[str, LensLine], names: Sequence[str], near
 
 def _listed(names: Sequence[str], last: str) -> str:
     return f"{', '.join(names[:-1])} {last} {names[-1]}"
+
+
+def add_once(statements: dict[str, LensLine], line: LensLine, where: str = "") -> None:
+    """Keep a statement by its keyword. Raises InputError for one that says otherwise before it."""
+    before = statements.get(line.keyword)
+    if not line.same_as(before):
+        assert before is not None
+        line.refuse(f"{where}says otherwise than line {before.number}", "leave one of them")
+    statements[line.keyword] = line
 
 
 class Frame:

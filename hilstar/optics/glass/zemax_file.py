@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.basics.errors import InputError, shortened
 from hilstar.optics.glass.lens_data import (
+    MAX_INDEX,
     NEAR_OBJECT,
     Aperture,
     FieldKind,
@@ -23,6 +24,8 @@ from hilstar.optics.glass.lens_data import (
     LensPrescription,
     LensSurface,
     PupilKind,
+    add_once,
+    lens_text,
     nth,
     only_aperture,
 )
@@ -172,11 +175,7 @@ def read_zemax(data: bytes) -> LensPrescription:
 
 
 def _lines(data: bytes) -> Iterator[LensLine]:
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        text = data.decode("utf-16", errors="replace")
-    else:
-        text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(lens_text(data).splitlines(), 1):
         items = line.split()
         if items:
             yield LensLine(number, items[0].upper(), items[1:], line)
@@ -213,7 +212,7 @@ class _Reader(LensFileReader):
         if line.keyword == "WAVM":
             self.waves.append(line)
         elif line.keyword in USED_SYSTEM:
-            self.head[line.keyword] = line
+            add_once(self.head, line)
         elif line.keyword in REFUSED_UNLESS_ZERO and line.is_zero():
             return
         elif line.keyword not in IGNORED_SYSTEM:
@@ -237,7 +236,7 @@ class _Reader(LensFileReader):
         elif line.keyword in APERTURES:
             surface.apertures.append(line)
         elif line.keyword in USED_SURFACE:
-            surface.values[line.keyword] = line
+            add_once(surface.values, line, f"at surface {surface.number} ")
         elif line.keyword in REFUSED_SURFACE:
             self._refuse_surface(line)
         elif line.keyword not in IGNORED_SURFACE:
@@ -303,6 +302,11 @@ class _Reader(LensFileReader):
         far = start.values.get("DISZ")
         if far is None or far.length() != float("inf"):
             raise InputError(f"{start.label}: {NEAR_OBJECT}")
+        image = self.surfaces[-1]
+        has_glass = "GLAS" in image.values
+        if has_glass or "DISZ" not in image.values or image.number_of("DISZ"):
+            told = "has a glass, a distance behind it, or no DISZ: an image has none"
+            raise InputError(f"{image.label} is the last, and {told}; is the file cut off?")
 
     def _pupil(self) -> tuple[PupilKind, float]:
         line = only_aperture(self.head, ("ENPD", "FNUM", "FLOA"), "OBNA")
@@ -450,7 +454,7 @@ class _Reader(LensFileReader):
         if kind == MODEL_GLASS or name == UNNAMED_GLASS:
             numbers = [line.value(place) if place < len(line.words) else 0.0 for place in (3, 4, 5)]
             index_d, abbe, anomaly = numbers
-            if index_d < 1 or abbe < 0:
+            if not 1 <= index_d <= MAX_INDEX or abbe < 0:
                 line.refuse(
                     f"at surface {surface.number} is a model of n = {index_d:g}, V = {abbe:g}",
                     "write its own numbers",

@@ -44,7 +44,8 @@ def warnings_anew():
 DELIMITERS = (",", ";", "\t", "|", "  ")
 HEADERS = ("plain", "comment", "units line", "vizier", "brackets")
 ENDS = ("\n", "\r\n")
-ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "cp1252")
+ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "cp1252")
+COMMENTS = ("# by a program", "% by", "! by", "// by, it", '"# by, it"', "; by a program")
 
 
 def in_dialect(values, delimiter, header, end, decimal):
@@ -233,3 +234,54 @@ def test_units_of_another_kind_have_no_factor():
     assert factor("deg", "s") is None
     assert factor("furlong", "nm") is None
     assert plain_unit("e⁻/s") == "e-/s"
+
+
+PLAIN = "t_s,x_px\n0.5,10.25\n1.5,11.25\n"
+SAME = [[0.5, 10.25], [1.5, 11.25]]
+
+
+@pytest.mark.parametrize("comment", COMMENTS)
+def test_comments_of_every_style_are_passed_over(table, comment):
+    assert numbers(table(f"{comment}\n{PLAIN}")) == SAME
+
+
+@pytest.mark.parametrize("comment", COMMENTS[:-1])  # within a table of semicolons ; is a cell
+def test_comments_between_rows_are_passed_over(table, comment):
+    assert numbers(table(PLAIN.replace("1.5", f"{comment}\n1.5"))) == SAME
+
+
+# What stands around a table, and what is said of it.
+SURROUNDINGS = {
+    "title": (f"Log of today\n\n{PLAIN}", "2 lines above"),
+    "values above": (f"Date,2024-01-01,10:00\nRate\n{PLAIN}", "2 lines above"),
+    "title above words": (
+        "A list of today\nx_px,t_s,name\n10.25,0.5,a\n11.25,1.5,b\n",
+        "line above",
+    ),
+    "comments behind": (f"{PLAIN}# the end\n% of it\n", ""),
+    "numbers of rows": ('t_s,x_px\n"1",0.5,10.25\n"2",1.5,11.25\n"3",2.5,12.25\n', "its number"),
+    "units in square brackets": ("t,x\n[s],[px]\n0.5,10.25\n1.5,11.25\n", ""),
+    "units in round ones": ("t,x\n(s),(px)\n0.5,10.25\n1.5,11.25\n", ""),
+    "a unit and none": ("t_s,x_px\n[s],[]\n0.5,10.25\n1.5,11.25\n", ""),
+}
+
+
+@pytest.mark.parametrize("name", SURROUNDINGS)
+def test_what_stands_around_a_table_is_told_apart_from_it(table, name, caplog):
+    text, words = SURROUNDINGS[name]
+    assert numbers(table(text))[:2] == SAME
+    assert words in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (PLAIN + PLAIN, r":4: the header stands here again"),
+        ("t_s,x_px,x_px.1\n0.5,1,2\n", r":1: column x_px is there twice \(x_px, x_px.1\)"),
+        ("time,x_px\nnoon,1\n", r":1: column time has 'noon', which is no time"),
+        ("t_s,x\n0,wide\n", r":1: column x has 'wide', which is no number px"),
+    ],
+)
+def test_what_other_programs_make_of_a_table_is_refused_by_name(table, text, words):
+    with pytest.raises(InputError, match=words):
+        rows(table(text))

@@ -127,10 +127,14 @@ PLACEHOLDERS = (
     "01010101", "01010101h", "deadbeef", "0xDEADBEEF", "12345678h", "ABCDEFG", "No Serial", "System Serial",
     "0000000000001", "0x00000000", "0x01010101", "16843009", "N/A", "n/a", "serial", "Serial Number", "demoset-1", "123456789",
     "1234567890", "0123456789", "987654321", "0x88888888", "2290649224", "0x20202020", "XXXXXXXX", "11111111", "none", "-",
+    "SN000001", "SERIAL123456", "No. 1", "1010101010", "0xBAADF00D", "PROTOTYPE", "LCD Panel", "HDMI", "Linux #0",
 )  # fmt: skip
 SERIALS = (
     "F00BAR",
     "CN0ABC1234",
+    "SN00042317",
+    "S/N 1045387",
+    "ABC123",
     "7",
     "16843010",
     "0x01010102",

@@ -100,6 +100,12 @@ def telemetry_text(header, good, bad, lost=LOST):
         ("is_valid", "1", "0", ",,,"),
         ("lost", "0", "1", LOST),
         ("valid", "ok", "bad", "0,0,0,0"),
+        ("AttitudeValid", "1", "0", LOST),
+        ("isValid", "true", "false", LOST),
+        ("st_valid", "Y", "N", LOST),
+        ("Valid Flag", "VALID", "INVALID", LOST),
+        ("validity [-]", "1", "0", "NULL,NULL,NULL,NULL"),
+        ("trackerLost", "0", "1", LOST),
     ],
 )
 def test_rows_that_the_log_marks_as_not_valid_are_left_out_and_said(log, header, good, bad, lost):
@@ -127,9 +133,105 @@ def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(log):
     )
 
 
-def test_a_column_of_marks_that_is_not_used_is_named(log):
-    found = open_log(log(telemetry_text("status", "TRACK", "ACQUIRE")))
-    assert "column status is not used" in dict(found.told)["log-table"]
+@pytest.mark.parametrize("key", ["is_valid", "attitudeValid", "st_valid"])
+def test_json_says_what_holds_by_the_names_of_tables(log, key):
+    rows = [f'{{"t_ns": {k}, "q": [{Q}], "{key}": {"false" if k else "true"}}}\n' for k in (0, 1)]
+    found = open_log(log("".join(rows)))
+    assert [sample.t_ns for sample in found.samples] == [0]
+    assert "1 line is marked as not valid" in dict(found.told)["log-valid"]
+
+
+@pytest.mark.parametrize("q", ["null", "[null, null, null, null]", "[NaN, NaN, NaN, NaN]"])
+def test_json_without_a_quaternion_is_left_out_at_the_start_and_refused_later(log, q):
+    blank, row = f'{{"t_ns": 0, "q": {q}}}\n', f'{{"t_ns": 5, "q": [{Q}]}}\n'
+    found = open_log(log(blank + row, "log.jsonl"))
+    assert [sample.t_ns for sample in found.samples] == [5]
+    assert "1 attitude is left out at the beginning" in dict(found.told)["log-start"]
+    with pytest.raises(InputError, match=r"log\.jsonl:2: .*dropout"):
+        open_log(log(row + blank, "log.jsonl"))
+
+
+@pytest.mark.parametrize(
+    ("header", "good", "bad"),
+    [
+        ("status", "TRACK", "ACQUIRE"),
+        ("attitude_status", "1", "0"),
+        ("qualityFlag", "0.9", "0.1"),
+        ("q_ok", "1", "0"),
+        ("rate_valid", "1", "0"),
+        ("error", "0", "1"),
+    ],
+)
+def test_a_column_of_marks_that_is_not_used_is_named(log, header, good, bad):
+    found = open_log(log(telemetry_text(header, good, bad)))
+    assert f"column {header} is not used" in dict(found.told)["log-table"]
+
+
+def test_a_column_of_figures_is_no_mark(log):
+    """An error in arcseconds marks no row."""
+    found = open_log(log(telemetry_text("pointing_error_arcsec", "2.5", "3.5")))
+    assert not found.told
+
+
+# A time of 0.5 s after 2024-01-01T00:00:00 UTC, by which column and how programs write it.
+DATES = [
+    ("t_s", "2024-01-01T00:00:00.500"),
+    ("time", "2024-01-01T00:00:00.500Z"),
+    ("Time (UTC)", "2024-01-01 00:00:00.5 UTC"),
+    ("timestamp", "2024-01-01T01:00:00.500+01:00"),
+    ("datetime", "2023-12-31 19:00:00.5-0500"),
+    ("utc", "2024-001T00:00:00.500"),
+    ("date", "2024:001:00:00:00.500000000"),
+    ("epoch", "2024/001 00:00:00.500"),
+]
+
+
+@pytest.mark.parametrize(("header", "written"), DATES)
+def test_dates_are_read_to_the_nanosecond_and_that_is_said(log, header, written):
+    path = log(f"{header},qw,qx,qy,qz\n{written},{Q}\n")
+    found = open_log(path)
+    assert found.samples[0].t_ns == 1_704_067_200_500_000_000
+    assert f"column {header} has dates" in dict(found.told)["log-table"]
+    if header == "t_s":  # the one name of it in telemetry
+        assert read_telemetry(path).t_ns.tolist() == [1_704_067_200_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("header", "written"),
+    [
+        ("time", "01/02/2024 00:00:00"),
+        ("timestamp", "12:00:00.5"),
+        ("t_s", "2024-02-30T00:00:00"),
+        ("t_s", "2023-366T00:00:00"),
+        ("t_s", "2024-01-01T24:00:01"),
+        ("t_s", "1_000.5"),
+        ("time", "2460310.5"),
+    ],
+)
+def test_a_time_that_may_be_another_is_refused_with_its_place(log, header, written):
+    with pytest.raises(InputError, match=r"log\.csv:[12]: .*write"):
+        open_log(log(f"{header},qw,qx,qy,qz\n{written},{Q}\n"))
+
+
+# What programs write for a quaternion before their estimator runs.
+NOTHING_YET = ("nan", "NaN", "NULL", "null", "None", "-", "--", "N/A", "#N/A", "<NA>", "-nan(ind)")
+NOTHING_YET += ("1.#QNAN", "?", ".", "", "0", "-0.0", "\\N")
+
+
+@pytest.mark.parametrize("word", NOTHING_YET)
+def test_rows_without_a_number_are_left_out_at_the_start_and_a_dropout_later(log, word):
+    blank = ",".join([word] * 4)
+    found = open_log(log(f"{HEAD}0.0,{blank}\n0.1,{blank}\n0.2,{Q}\n0.3,{Q}\n"))
+    assert [sample.t_ns for sample in found.samples] == [200_000_000, 300_000_000]
+    assert "2 attitudes are left out at the beginning" in dict(found.told)["log-start"]
+    with pytest.raises(InputError, match=r"log\.csv:3: .*dropout"):
+        open_log(log(f"{HEAD}0.0,{Q}\n0.1,{blank}\n0.2,{Q}\n"))
+
+
+@pytest.mark.parametrize("word", ["1e999", "inf", "#VALUE!", "lost", "0_5", "0.5f", "0x1"])
+def test_words_that_are_no_blank_are_refused_with_their_line(log, word):
+    with pytest.raises(InputError, match=r"log\.csv:2: "):
+        open_log(log(f"{HEAD}0.0,{','.join([word] * 4)}\n0.2,{Q}\n"))
 
 
 def test_dialects_of_a_log_are_read(log):

@@ -254,3 +254,38 @@ def test_a_decentre_with_return_leaves_the_axis():
     assert real_rays(lens, at, along)[0][:2] == pytest.approx(
         np.array([[0, 0], [40, 40]]), abs=1e-9
     )
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-8-sig", "cp1252"])
+def test_a_lens_is_the_same_in_every_encoding(encoding):
+    lens = read_codev(seq().decode().encode(encoding))
+    assert focal_length_mm(lens) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["ASP", "A 1e-7 B 1e-10"], r"line \d+: A at surface 1 .* has B 1e-10 behind it; put ;"),
+        (["K -1", "K -2"], r"line \d+: K at surface 1 .* says otherwise than line"),
+        (["// a comment"], r"line \d+: // at surface 1 .* is not known"),
+        (["CIR S1 8"], r"line \d+: CIR at surface 1 .* has S1"),
+    ],
+)
+def test_what_another_program_would_take_is_refused_by_its_line(lines, words):
+    with pytest.raises(InputError, match=words):
+        read_codev(seq(more={1: lines}))
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "words"),
+    [
+        ("WL 587.5618", "WL 0.5875618", "its wavelength is 0.000587562 um"),
+        ("NBK7_SCHOTT", "5168:64.2", "has the glass 5168:64.2; write n:V"),
+    ],
+)
+def test_numbers_in_another_unit_are_refused(was, now, words):
+    text = seq().decode()
+    assert was in text or "N-BK7" in text
+    text = text.replace(was, now) if was in text else text.replace("N-BK7", now)
+    with pytest.raises(InputError, match=words):
+        read_codev(text.encode())

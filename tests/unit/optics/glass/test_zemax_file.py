@@ -161,7 +161,7 @@ def test_what_is_not_known_is_refused_by_its_line(line, words):
 )
 def test_what_a_system_line_says_is_used_or_refused(line, words):
     with pytest.raises(InputError, match=words):
-        read_zemax(zmx().replace(b"WAVM 1", line.encode() + b"\r\nWAVM 1"))
+        read_zemax(zmx("ENPD 20", line))
 
 
 def test_the_editors_lists_behind_the_lens_are_passed_over():
@@ -227,3 +227,45 @@ def test_a_wide_pupil_on_a_small_sphere_is_refused():
         match=r"surface 1 \(line \d+\) has a radius of 61.47 mm, and the pupil is 200 mm wide",
     ):
         read_zemax(zmx("ENPD 200"))
+
+
+ENCODINGS = ("utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "cp1252")
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_lens_is_the_same_in_every_encoding(encoding):
+    lens = read_zemax(zmx(more={1: ["  COMM 'été'"]}).decode().encode(encoding))
+    assert focal_length_mm(lens) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["WAVM 1 550 1"], "its wavelength is 550 um: is it in another unit"),
+        (["WAVM 1 5.5e-7 1"], "its wavelength is 5.5e-07 um"),
+        (["ENPD 20", "ENPD 10"], "ENPD says otherwise than line"),
+        (["UNIT MM", "ENPD 20", "UNIT IN"], "UNIT says otherwise than line"),
+    ],
+)
+def test_a_system_that_contradicts_itself_is_refused(lines, words):
+    if not any(line.startswith("ENPD") for line in lines):
+        lines = [*lines, "ENPD 20"]
+    with pytest.raises(InputError, match=words):
+        read_zemax(zmx(*lines))
+
+
+@pytest.mark.parametrize("keyword", ["CURV 0.01", "DISZ 3", "GLAS N-F2 0 0", "CONI -1"])
+def test_a_surface_s_line_that_stands_twice_is_refused(keyword):
+    twice = [f"  {keyword}", f"  {keyword}5"]
+    with pytest.raises(InputError, match=r"line \d+: [A-Z]+ at surface 2 says otherwise than line"):
+        read_zemax(zmx(more={2: twice}))
+    same = zmx(more={2: [f"  {keyword}"] * 2})
+    assert len(read_zemax(same).surfaces) == 4
+
+
+@pytest.mark.parametrize("behind", ["SURF 4", "GLAS N-SF5", "DISZ 2.5", "SURF 2"])
+def test_a_file_that_is_cut_off_has_no_image_and_is_refused(behind):
+    """A lens of fewer surfaces has another focal length, and nothing else would say so."""
+    text = zmx().decode()
+    with pytest.raises(InputError, match=r"is the last, .*is the file cut off\?"):
+        read_zemax(text[: text.index(behind)].encode())

@@ -22,7 +22,7 @@ from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.resolution import Resolution
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
-from hilstar.attitude.clock.senders import Repeats, Senders
+from hilstar.attitude.clock.senders import Senders
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
@@ -235,7 +235,6 @@ class Receiver:
         self._timeline = timeline
         self.back = BackChannel(link, traffic, now_ns)
         self._watch = watch
-        self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices, read_as=read_as)
         self._unit, self._resolution = TimeUnit(self._notices), Resolution(self._notices.tell)
         self._losses = LossCount()
@@ -373,14 +372,6 @@ class Receiver:
             case wire.AttitudeSample() as sample:
                 self.counts.received += 1
                 self._unit.see(sample.t_ns, arrival.host_ns)
-                refusal = self._repeats.judge(sample, arrival.host_ns, arrival.raw)
-                if refusal is not None:
-                    self._refuse(arrival, refusal)
-                    return
-                self._resolution.see(sample)
-                self._rates.see(sample, arrival.host_ns)
-                if self._repeats.resumed():
-                    self.jumps.forgive()
                 own = Arrival(
                     arrival.host_ns,
                     sample,
@@ -401,10 +392,14 @@ class Receiver:
         """Take samples whose sender is decided: the one shown, or another, whose samples are
         refused.
         """
+        if self._senders.resumed():
+            self.jumps.forgive()
         for arrival in arrivals:
             if arrival.refusal is not None:
                 self._refuse(arrival, arrival.refusal)
                 continue
+            self._resolution.see(arrival.event)
+            self._rates.see(arrival.event, arrival.host_ns)
             self._losses.see(arrival.event.sequence)
             self.counts.lost = self._losses.lost
             if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:

@@ -25,6 +25,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import U32, AttitudeSample, Refusal
 from hilstar.basics.notices import Notices
@@ -229,10 +230,10 @@ class Repeats:
     sending them.
     """
 
-    def __init__(self, notices: Notices) -> None:
-        self._notices = notices
+    def __init__(self, notices: Notices, state: StreamState) -> None:
+        self._notices, self._state = notices, state
         self._count = 0
-        self._frozen = self._resumed = False
+        self._frozen = False
 
     def refused(self, arrival: SampleArrival, newest: _Counter) -> SampleArrival:
         """A message that repeats the time of the newest, or an earlier message, refused."""
@@ -253,13 +254,8 @@ class Repeats:
         """A message with another time is shown."""
         self._count = 0
         if self._frozen:
-            self._frozen, self._resumed = False, True
+            self._frozen, self._state.resumed = False, True
             self._notices.end(FROZEN, "source-resumed", "the sender's clock runs again")
-
-    def resumed(self) -> bool:
-        """True once after a freeze."""
-        resumed, self._resumed = self._resumed, False
-        return resumed
 
 
 class _Held(NamedTuple):
@@ -285,10 +281,10 @@ def _named(identity: Identity) -> str:
 class Senders:
     """Follows the sender that was there first, until it has been silent for `silent_after_ns`."""
 
-    def __init__(self, silent_after_ns: int, notices: Notices) -> None:
+    def __init__(self, silent_after_ns: int, notices: Notices, state: StreamState) -> None:
         self._silent_after_ns = silent_after_ns
-        self._notices = notices
-        self._repeats = Repeats(notices)
+        self._notices, self._state = notices, state
+        self._repeats = Repeats(notices, state)
         self._main: _Counter | None = None
         # of the sender shown
         self._identity: Identity = None
@@ -322,13 +318,13 @@ class Senders:
             return self._speaks(main, arrival)
         return self._take_strange(main, arrival, other)
 
-    def expire(self, host_ns: int) -> list[SampleArrival]:
+    def expire(self, now_ns: int) -> list[SampleArrival]:
         """Messages held, where the sender shown has been silent for longer than it usually is."""
         main = self._main
-        if main is None or not self._held:
+        if main is None or not self._held or self._state.busy:
             return []
         counter = self._held[-1].counter
-        if not self._gives_way(main, counter, host_ns - main.host_ns):
+        if not self._gives_way(main, counter, now_ns - main.host_ns):
             return []
         if counter is main or not main.established:
             return self._released()
@@ -339,10 +335,6 @@ class Senders:
         if self._main is not None and self._main.established and not self._irregular:
             return self._decided(self._main)
         return self._released()
-
-    def resumed(self) -> bool:
-        """True once after the clock of the sender shown had stopped."""
-        return self._repeats.resumed()
 
     def _begin(self, arrival: SampleArrival) -> list[SampleArrival]:
         """Show this message's sender, of which nothing but this is known."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.senders import ESTABLISHED_AFTER, MIN_RUN, Senders
+from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import U32, AttitudeSample
 from hilstar.basics.notices import Notices
@@ -36,7 +37,7 @@ class Shown:
 
     def __init__(self) -> None:
         self.notices = Notices()
-        self.senders = Senders(STALE_AFTER_NS, self.notices)
+        self.senders = Senders(STALE_AFTER_NS, self.notices, StreamState())
         self.arrivals: list[SampleArrival] = []
         self.refused: list[tuple[int, str]] = []
 

@@ -22,7 +22,8 @@ from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.resolution import Resolution
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
-from hilstar.attitude.clock.senders import Repeats, Senders
+from hilstar.attitude.clock.senders import Senders
+from hilstar.attitude.clock.stages import Each, Stages, StreamState
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
@@ -223,9 +224,10 @@ class Receiver:
         self._notices = Notices() if notices is None else notices
         self._unix_offset = unix_offset if traffic.clock == "unix" else None
         self._known_ns = 0
+        self._state = StreamState()
         if traffic.clock == "estimated":
             self.clock = SenderClock()
-            self.jumps: JumpFilter | KnownClockFilter = JumpFilter(self.clock)
+            self.jumps: JumpFilter | KnownClockFilter = JumpFilter(self.clock, self._state)
         else:
             known = SAME_CLOCK if self._unix_offset is None else self._unix_offset()
             self.clock = SenderClock(known, traffic.clock)
@@ -235,13 +237,14 @@ class Receiver:
         self._timeline = timeline
         self.back = BackChannel(link, traffic, now_ns)
         self._watch = watch
-        self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices, read_as=read_as)
         self._unit, self._resolution = TimeUnit(self._notices), Resolution(self._notices.tell)
         self._losses = LossCount()
         self.tell_lost: Callable[[int], None] = lambda number: None
         self._lost_told = self._lost_before = self._lost_look_ns = 0
-        self._senders = Senders(timeline.policy.stale_after_ns, self._notices)
+        senders = Senders(timeline.policy.stale_after_ns, self._notices, self._state)
+        stages = (Each(self._arrived), senders, Each(self._is_of_sender_shown), self.jumps)
+        self._stages = Stages(stages, self._settle)
         self._begun_ns: int | None = None
         self._learn_from_ns: int | None = None
         self._empty_ns = 0
@@ -307,8 +310,8 @@ class Receiver:
 
     def release(self) -> None:
         """Take the samples still in doubt: no more will come to decide them."""
-        self._take_decided(self._senders.release())
-        self._settle(self.jumps.release())
+        self._stages.release()
+        self._tell_clock()
         self._settle_losses(self.counts.lost)
 
     def _settle_losses(self, lost: int) -> None:
@@ -342,9 +345,9 @@ class Receiver:
             waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
             self._take(arrival, arrival.waited_ns if self._link.stamped else waited_ns)
         now_ns = self._now_ns()
-        if not arrivals:  # else the sender shown may have spoken, and is not read yet
-            self._take_decided(self._senders.expire(now_ns))
-        self._settle(self.jumps.expire(now_ns))
+        self._state.busy = bool(arrivals)
+        self._stages.expire(now_ns)
+        self._tell_clock()
         if now_ns - self._lost_look_ns >= NS_PER_S:
             self._settle_losses(min(self._lost_before, self.counts.lost))
             self._lost_before, self._lost_look_ns = self.counts.lost, now_ns
@@ -372,24 +375,17 @@ class Receiver:
                     self.clock.exchange(exchange)
             case wire.AttitudeSample() as sample:
                 self.counts.received += 1
-                self._unit.see(sample.t_ns, arrival.host_ns)
-                refusal = self._repeats.judge(sample, arrival.host_ns, arrival.raw)
-                if refusal is not None:
-                    self._refuse(arrival, refusal)
-                    return
-                self._resolution.see(sample)
-                self._rates.see(sample, arrival.host_ns)
-                if self._repeats.resumed():
-                    self.jumps.forgive()
-                own = Arrival(
-                    arrival.host_ns,
-                    sample,
-                    arrival.raw,
-                    waited_ns,
-                    back=arrival.back,
-                    address=arrival.address,
+                self._stages.take(
+                    Arrival(
+                        arrival.host_ns,
+                        sample,
+                        arrival.raw,
+                        waited_ns,
+                        back=arrival.back,
+                        address=arrival.address,
+                    )
                 )
-                self._take_decided(self._senders.take(own))
+                self._tell_clock()
             case other:
                 self.counts.received += 1
                 refusal = wire.Refusal(
@@ -397,43 +393,42 @@ class Receiver:
                 )
                 self._refuse(arrival, other if isinstance(other, wire.Refusal) else refusal)
 
-    def _take_decided(self, arrivals: list[SampleArrival]) -> None:
-        """Take samples whose sender is decided: the one shown, or another, whose samples are
-        refused.
-        """
-        for arrival in arrivals:
-            if arrival.refusal is not None:
-                self._refuse(arrival, arrival.refusal)
-                continue
-            self._losses.see(arrival.event.sequence)
-            self.counts.lost = self._losses.lost
-            if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:
-                arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
-            elif self.clock.unheard:
-                self.back.ask_quickly(arrival.host_ns)
-            self._settle(self.jumps.take(arrival))
-            slowness = self.jumps.slowness
-            if slowness and not self.clock.synchronised and not self._unit.named:
-                detail = (
-                    f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small"
-                    " steps"
-                )
-                if slowness > 0:
-                    detail += " (a slow clock, or a link too slow for all packets)"
-                self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
+    def _arrived(self, arrival: SampleArrival) -> SampleArrival:
+        """Look at the time of any sender's message."""
+        self._unit.see(arrival.event.t_ns, arrival.host_ns)
+        return arrival
 
-    def _settle(self, decided: list[SampleArrival]) -> None:
-        for arrival in decided:
-            sample, host_ns = arrival.event, arrival.host_ns
-            refusal = arrival.refusal or self._timeline.add(self._rates.believed(sample), host_ns)
-            if refusal is not None:
-                self._refuse(arrival, refusal)
-                continue
-            self.back.follow(arrival)
-            if arrival.waited_ns != WAITED_UNKNOWN_NS:
-                latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
-                self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)
-            self._watch(host_ns, arrival.raw, sample, None)
+    def _is_of_sender_shown(self, arrival: SampleArrival) -> SampleArrival:
+        """Look at a message of the sender shown, whose times are still its own: rates are seen
+        here, and believed where the sample is shown.
+        """
+        self._resolution.see(arrival.event)
+        self._rates.see(arrival.event, arrival.host_ns)
+        self._losses.see(arrival.event.sequence)
+        if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:
+            return replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
+        if self.clock.unheard:
+            self.back.ask_quickly(arrival.host_ns)
+        return arrival
+
+    def _settle(self, arrival: SampleArrival) -> None:
+        """Show a sample that has passed all stages, or count it as refused."""
+        sample, host_ns = arrival.event, arrival.host_ns
+        refusal = arrival.refusal or self._timeline.add(self._rates.believed(sample), host_ns)
+        if refusal is not None:
+            self._refuse(arrival, refusal)
+            return
+        self.back.follow(arrival)
+        if arrival.waited_ns != WAITED_UNKNOWN_NS:
+            latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
+            self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)
+        self._watch(host_ns, arrival.raw, sample, None)
+
+    def _tell_clock(self) -> None:
+        """Count what was lost so far; say where the sender's clock has jumped, or runs at another
+        pace.
+        """
+        self.counts.lost = self._losses.lost
         if self.jumps.jumps > self._jumps_told:
             self._jumps_told = self.jumps.jumps
             total_s = self.jumps.correction_ns / NS_PER_S
@@ -442,6 +437,14 @@ class Receiver:
                 f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream"
                 " continues",
             )
+        slowness = self.jumps.slowness
+        if slowness and not self.clock.synchronised and not self._unit.named:
+            detail = (
+                f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small steps"
+            )
+            if slowness > 0:
+                detail += " (a slow clock, or a link too slow for all packets)"
+            self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
 
     def _refuse(self, arrival: Arrival[wire.Event], refusal: wire.Refusal) -> None:
         if self.counts.refuse(refusal):

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hilstar.attitude.clock.sender_clock import SenderClock, Slots
+from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.basics.notices import Notices
@@ -156,10 +157,10 @@ class JumpFilter:
     It teaches `clock` what it accepts, on the continuous times.
     """
 
-    def __init__(self, clock: SenderClock) -> None:
+    def __init__(self, clock: SenderClock, state: StreamState) -> None:
         self.correction_ns = 0  # continuous time minus the sender's
         self.jumps = 0
-        self._clock = clock
+        self._clock, self._state = clock, state
         self._pace = _Pace()
         self._steps = _TimeSteps()
         self._usual_ns: deque[float] = deque(maxlen=256)  # delays that raise no doubt
@@ -170,7 +171,6 @@ class JumpFilter:
         self._near_count = 0
         self._near_ns: int | None = None  # when the last one came that was neither late nor early
         self._shows_none = False  # t_ns itself advanced as usual where the samples in doubt began
-        self._resumes = False
 
     @property
     def settled(self) -> bool:
@@ -183,10 +183,6 @@ class JumpFilter:
         fast.
         """
         return self._pace.slowness
-
-    def forgive(self) -> None:
-        """The sender's clock stood still: it did not jump where it resumes."""
-        self._resumes = True
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
         """The samples that this one decides, itself among them unless it is in doubt."""
@@ -220,9 +216,9 @@ class JumpFilter:
         self._doubtful.append(_Doubtful(arrival, late_ns))
         return [*decided, *self._jumped(arrival.host_ns)]
 
-    def expire(self, host_ns: int) -> list[SampleArrival]:
+    def expire(self, now_ns: int) -> list[SampleArrival]:
         """Samples in doubt that nothing followed."""
-        if self._doubtful and host_ns - self._doubtful[-1].arrival.host_ns > MAX_DOUBT_NS:
+        if self._doubtful and now_ns - self._doubtful[-1].arrival.host_ns > MAX_DOUBT_NS:
             return self.release()
         return []
 
@@ -274,7 +270,7 @@ class JumpFilter:
         if late_ns > self._late_limit_ns(host_ns):
             return
         self._near_ns = host_ns
-        self._resumes = False
+        self._state.resumed = False
         self._usual_ns.append(max(late_ns, 0.0))
         self._near_count += 1
         if self._near_count >= SETTLED_AFTER and host_ns - self._first_ns >= SETTLED_AFTER_NS:
@@ -290,13 +286,13 @@ class JumpFilter:
         """
         late_ns = [each.late_ns for each in self._doubtful]
         for_ns = host_ns - self._doubtful[0].arrival.host_ns
-        if self._shows_none and not self._resumes:
+        if self._shows_none and not self._state.resumed:
             is_jump = for_ns >= CLEARLY_LATE_FOR_NS
         else:
             is_jump = late_ns[-1] < 0 or late_ns[-1] > SURELY_A_JUMP_NS or for_ns >= LATE_FOR_NS
         if not is_jump or len(late_ns) < MIN_AGREEING:
             return []
-        is_new = not self._resumes
+        is_new = not self._state.resumed
         # the earliest of them is then as late as the earliest ever was
         self.correction_ns += round(min(late_ns))
         released = self.release()
@@ -429,10 +425,7 @@ class KnownClockFilter:
         name = CLOCK_NAMES[self._clock.mode]
         return f"{abs(late_ns) / NS_PER_S:.3f} s {sense} {name} of this machine"
 
-    def forgive(self) -> None:
-        """Jumps are never counted."""
-
-    def expire(self, host_ns: int) -> list[SampleArrival]:
+    def expire(self, now_ns: int) -> list[SampleArrival]:
         """No sample is ever in doubt."""
         return []
 

@@ -250,8 +250,10 @@ def late_sender(first: int, counts: bool = True, offset_ns: int = 0) -> Sender:
     return Sender(LYRA, first, offset_ns, counts)
 
 
-@pytest.mark.parametrize("counts", [True, False])
-@pytest.mark.parametrize("first", [0, 398, 100_000])
+@pytest.mark.parametrize(
+    ("first", "counts"),
+    [(0, True), (398, True), (100_000, True), (398, False), (100_000, False)],
+)
 def test_of_two_senders_the_first_is_shown_and_the_other_refused(counts, first):
     """The second begins after two seconds, on the same clock, and ends after six."""
     run = Run(
@@ -283,6 +285,28 @@ def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept
     assert run.counts.refused_by["source"] > 500
     assert abs(run.shown[-1] @ ORION) > 0.999
     assert max(run.ages_ms[-300:]) < 40
+
+
+def test_two_senders_that_do_not_count_on_one_clock_are_not_told():
+    run = Run(
+        lambda t0: (
+            Sender(counts=False).packets(t0, seconds(0, 4))
+            + late_sender(0, counts=False).packets(t0 + 2_300_000, seconds(2, 4))
+        )
+    )
+    assert (run.accepted, run.events) == (1200, {})
+
+
+def test_a_second_sender_that_begins_at_the_first_one_s_next_count_takes_its_place():
+    """It is told that there are two."""
+    run = Run(
+        lambda t0: (
+            Sender().packets(t0, seconds(0, 4))
+            + late_sender(401).packets(t0 + 2_300_000, seconds(2, 4))
+        )
+    )
+    assert run.events == {"second-sender": 1}
+    assert abs(run.shown[-1] @ LYRA) > 0.999
 
 
 HERE, THERE = ("127.0.0.1", 4001), ("127.0.0.1", 4002)

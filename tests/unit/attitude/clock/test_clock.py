@@ -15,6 +15,7 @@ from hilstar.attitude.clock.sender_clock import (
     Exchange,
     SenderClock,
 )
+from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
@@ -41,7 +42,7 @@ class Run:
     ) -> None:
         rng = np.random.default_rng(1)
         self.clock = SenderClock()
-        self.jumps = JumpFilter(self.clock)
+        self.jumps = JumpFilter(self.clock, StreamState())
         self.refused = self.accepted = 0
         errors = []
         newest_ns, newest = -(2**80), 0

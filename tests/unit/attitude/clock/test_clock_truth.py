@@ -15,6 +15,7 @@ import pytest
 
 from hilstar.attitude.clock.jumps import LATE_FOR_NS, WAITED_UNKNOWN_NS, JumpFilter
 from hilstar.attitude.clock.sender_clock import Exchange, SenderClock
+from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
@@ -53,7 +54,7 @@ class Truth:
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
         self.clock = SenderClock()
-        self.jumps = JumpFilter(self.clock)
+        self.jumps = JumpFilter(self.clock, StreamState())
         newest_ns, read_ns = -(2**80), 0
         for k in range(self.count):
             sent_ns = HOST0_NS + k * PERIOD_NS

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.special import log_ndtr
 
-from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.charts import BLUE, MUTED, chart, label_ends, write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, NS_PER_S, magnitude
@@ -448,7 +448,7 @@ class LatticeSums:
         total = int(self._counts[0] * self._counts[1])
         self._light, self._pixels, self._bad = (np.zeros(total) for _ in range(3))
 
-    def add(self, looked_at: FloatArray, image: Float32Array, bad: BoolArray) -> None:
+    def add(self, looked_at: FloatArray, image: FloatArray, bad: BoolArray) -> None:
         """Add pixels (n,) of the tracker, which look at places (2, n) on the monitor, px."""
         firsts, counts, total = self._firsts, self._counts, len(self._light)
         place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / self._period
@@ -471,7 +471,7 @@ class LatticeSums:
 
 
 def _add_rows(
-    geometry: BenchGeometry, sums: list[LatticeSums], images: list[Float32Array], bad: BoolArray
+    geometry: BenchGeometry, sums: list[LatticeSums], images: list[FloatArray], bad: BoolArray
 ) -> None:
     """Add the image (h, w) of each lattice to its sums, some rows at a time: where all pixels
     look, and what follows from it, took 1 GB of 5 million.

@@ -1,5 +1,5 @@
-"""A Bayer mosaic: light by channel to the pixels that see it, and the luminance in which a
-tracker's software finds stars.
+"""A Bayer mosaic: light by channel to the pixels that see it; and the image in which a tracker's
+software finds stars: the luminance of a mosaic, and what a black screen is in it.
 """
 
 from collections.abc import Iterable
@@ -16,6 +16,7 @@ CHANNELS = "rgb"
 # pixel squared more.
 SUPERPIXEL = np.array([0.25, 0.5, 0.25])
 SUPERPIXEL_VARIANCE_PX2 = 0.5
+EVEN_DARK_DN = 1.0  # a step of the ADC, from the darkest pixel of a black screen to the brightest
 
 
 def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArray:
@@ -73,3 +74,15 @@ def software_psf_px(psf_px: tuple[float, float], detector: DetectorSettings) -> 
         return psf_px
     x, y = (float(np.sqrt(sigma**2 + SUPERPIXEL_VARIANCE_PX2)) for sigma in psf_px)
     return x, y
+
+
+def uneven_dark_dn(under_e: FloatArray, detector: DetectorSettings) -> FloatArray | None:
+    """What electrons under the stars (h, w) are in the software's image, DN; None where that is
+    even.
+
+    A screen that is seen whole glows over a part of the field, which is one large spot to software
+    that takes one level for the whole image.
+    """
+    dark_dn = detector.offset_dn + under_e / detector.gain_e_per_dn
+    dark_dn = software_image(np.clip(dark_dn, 0.0, 2.0**detector.bits - 1), detector)
+    return dark_dn if np.ptp(dark_dn) > EVEN_DARK_DN else None

@@ -21,6 +21,9 @@ from hilstar.basics.arrays import FloatArray
 
 # of the reading of a level that noise spreads over the steps, beside that noise
 VARIANCE_DN2 = 1 / 12
+# Readings of a level half way between two codes have a variance of a quarter, without any noise: up
+# to this, their variance does not tell the noise before the ADC.
+AMBIGUOUS_DN2 = 1 / 4 + VARIANCE_DN2
 STEP_PHASES = 16  # places of a dark level between two steps
 PLACES_DN = np.arange(STEP_PHASES)[:, None] / STEP_PHASES
 HARMONICS = np.arange(1, 9)  # of the sawtooth that rounding is: eight hold 93 % of its variance
@@ -28,9 +31,14 @@ UNCUT_SIGMAS = 4.0  # of a dark level above code 0: what is cut off is under 1e-
 DITHERED_DN = 0.6  # of noise: the largest harmonic is then 3e-4 DN
 
 
-def before_adc_dn(variance_dn2: float) -> float:
-    """The noise of a pixel before the ADC, DN, by the variance of its readings."""
-    return math.sqrt(max(variance_dn2 - VARIANCE_DN2, 0.0))
+def before_adc_dn(variance_dn2: float, stated_dn: float) -> float:
+    """The noise of a pixel before the ADC, DN, by the variance of its readings.
+
+    Where that does not tell it, it is the noise that is stated, if that is smaller: the less noise,
+    the larger is the error of rounding.
+    """
+    read_dn = math.sqrt(max(variance_dn2 - VARIANCE_DN2, 0.0))
+    return min(read_dn, stated_dn) if variance_dn2 < AMBIGUOUS_DN2 else read_dn
 
 
 def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:

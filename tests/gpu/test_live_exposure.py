@@ -14,6 +14,8 @@ from hilstar.basics.rotation import normalise
 from hilstar.display.calibration import CalibrationHead, NotesTable, write_calibration
 from hilstar.display.response import srgb_response
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
+from hilstar.instruments.campaign.plan import Centroiding
+from hilstar.instruments.campaign.solvers import CentroidSolver
 from hilstar.instruments.simulate.live_exposure import TRACKING, LiveTracker
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import read_bench_file
@@ -25,6 +27,7 @@ ORION = normalise(np.array(ORION_Q))
 FRAMES = 6
 BITS, BLACK = 8, 2e-3  # a glow of 30 DN a detector pixel
 MIN_FOUND = 8
+MAX_OFF_PX = 0.3  # stars of a few hundred electrons, in read noise of 12
 PERIOD_NS = 16_666_667
 SAME = 1e-6  # of the brightest pixel: both add the same float32 shares, in another order
 
@@ -84,18 +87,23 @@ def test_both_trackers_see_the_same_electrons(tmp_path: Path, rng, monkeypatch, 
     assert wanted.max() > 1000
 
 
-def test_stars_are_found_on_a_screen_that_glows_over_a_part_of_the_field(tmp_path: Path, rng):
-    """A screen seen whole was one large spot above the dark around it: no star was found."""
+def glowing_file(folder: Path):
+    """A bench whose screen is seen whole, and glows where it is black."""
     head = CalibrationHead("photometric", "", "2026-11-28", "", "relative", BITS, "light.csv")
     light = srgb_response(BITS).light + BLACK
-    write_calibration(tmp_path / "light.toml", head, {"w": light}, 0.0, NotesTable())
+    write_calibration(folder / "light.toml", head, {"w": light}, 0.0, NotesTable())
     changes = {
         "monitor": {"bits": BITS, "calibration": "light.toml"},
         "tracker": {"focal_length_mm": 12},
         "tracker.detector": {"offset_dn": 40, "read_noise_e": 12},
     }
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN, changes))
-    file = read_bench_file(tmp_path / "bench.toml")
+    (folder / "bench.toml").write_text(bench_text(TWIN, changes))
+    return read_bench_file(folder / "bench.toml")
+
+
+def test_stars_are_found_on_a_screen_that_glows_over_a_part_of_the_field(tmp_path: Path, rng):
+    """A screen seen whole was one large spot above the dark around it: no star was found."""
+    file = glowing_file(tmp_path)
     with open_bench(file) as bench, LiveTracker(file, rng) as live:
         for number in range(FRAMES + 1):
             live.take(frame_of(bench, number))
@@ -106,3 +114,18 @@ def test_stars_are_found_on_a_screen_that_glows_over_a_part_of_the_field(tmp_pat
     assert glow_dn > 10
     assert solved.mode == TRACKING
     assert len(solved.found) >= MIN_FOUND
+
+
+@pytest.mark.parametrize("centroider", ["window", "psf"])
+def test_a_campaign_s_centroids_are_found_on_such_a_screen_too(tmp_path: Path, rng, centroider):
+    tracker = DisplayTracker(glowing_file(tmp_path))
+    try:
+        exposure_s = tracker.config.tracker.exposure_s
+        exposure = tracker.expose(View.exposure(ORION, np.zeros(3), exposure_s, None), rng)
+        answer = CentroidSolver(Centroiding(centroider=centroider)).solve(exposure, tracker)
+    finally:
+        tracker.close()
+    errors = answer.star_errors
+    assert errors.matched >= MIN_FOUND
+    assert errors.false <= errors.matched
+    assert float(np.median(np.hypot(errors.dx_px, errors.dy_px))) < MAX_OFF_PX

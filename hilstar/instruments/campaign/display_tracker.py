@@ -28,6 +28,7 @@ from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import before_detector, tracker_camera
 from hilstar.server.bench.config import GAUSSIAN, BenchConfig
 from hilstar.tracker.detector import Detector
+from hilstar.tracker.mosaic import uneven_dark_dn
 
 
 class DisplayTracker:
@@ -88,6 +89,11 @@ class DisplayTracker:
             before_detector(self.config, self.file.folder, self._bench.camera),
         )
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
+
+    def dark_dn(self, exposure_s: float) -> FloatArray | None:
+        """What a black screen is in the software's image (h, w), DN; None where that is even."""
+        glow_e = self._colours.grey(self._glow_e_per_s) * exposure_s
+        return uneven_dark_dn(glow_e + self._background.steady_e, self.config.tracker.detector)
 
     def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
         """One exposure of the display, without noise if there is no generator. Raises InputError

@@ -39,7 +39,13 @@ from hilstar.server.bench.cameras import flight_camera, tracker_psf
 from hilstar.server.bench.config import GAUSSIAN
 from hilstar.server.bench.config.hardware import TrackerOptics
 from hilstar.tracker.centroiders import Places, psf_places
-from hilstar.tracker.centroids import CentroidSettings, estimate_background, find_stars
+from hilstar.tracker.centroids import (
+    CentroidSettings,
+    LocalBackground,
+    estimate_background,
+    find_stars,
+    noisiest_background,
+)
 from hilstar.tracker.identify import wahba
 from hilstar.tracker.mosaic import software_image, software_psf_px
 
@@ -141,12 +147,9 @@ class CentroidSolver:
             window_sigma_px=wanted.window_sigma_px or max(1.0, *width_px),
             psf_sigma_px=width_px if wanted.remove_s_curve else None,
         )
-        image, truth, (height, width) = (
-            software_image(exposure.dn, detector),
-            exposure.truth,
-            exposure.dn.shape,
-        )
-        found = find_stars(image, settings)
+        truth, (height, width) = exposure.truth, exposure.dn.shape
+        image, background = _image_to_search(exposure, tracker)
+        found = find_stars(image, settings, background)
         with np.errstate(invalid="ignore"):
             off_x, off_y = (
                 np.abs(truth[name] - (side - 1) / 2)
@@ -191,7 +194,8 @@ class CentroidSolver:
         psf, glass = self._told_by(tracker)
         pixels = np.rint(first[1]).astype(np.intp), np.rint(first[0]).astype(np.intp)
         reach = psf.footprint_px // 2 + 1
-        padded = np.pad(exposure.dn - estimate_background(exposure.dn).level, 2 * reach)
+        image, background = _image_to_search(exposure, tracker)
+        padded = np.pad(image - background.level, 2 * reach)
         near = np.arange(reach, 3 * reach + 1)
         stamps = padded[
             (pixels[0][:, None] + near)[:, :, None], (pixels[1][:, None] + near)[:, None, :]
@@ -218,6 +222,24 @@ class CentroidSolver:
             glass = star_glass(tracker.file, told) if simulated else None
             self._told = tracker.file.sha256, told, glass
         return self._told[1:]
+
+
+def _image_to_search(
+    exposure: Exposure, tracker: SolvedTracker
+) -> tuple[npt.NDArray[Any], LocalBackground]:
+    """The software's image (h, w) of an exposure, DN, and its background.
+
+    Where a display's black glows over a part of the field, that is taken off, as a tracker takes
+    its dark frame: else no star on it is found.
+    """
+    image = software_image(exposure.dn, tracker.config.tracker.detector)
+    dark_dn = None
+    if isinstance(tracker, DisplayTracker):
+        dark_dn = tracker.dark_dn(exposure.view.exposure_s)
+    if dark_dn is None:
+        return image, estimate_background(image)
+    above = image - dark_dn
+    return above, noisiest_background(above)
 
 
 class FunctionSolver:

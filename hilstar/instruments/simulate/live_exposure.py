@@ -44,7 +44,7 @@ from hilstar.tracker.centroids import (
 )
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
-from hilstar.tracker.mosaic import software_image, software_psf_px
+from hilstar.tracker.mosaic import software_image, software_psf_px, uneven_dark_dn
 
 TRACKING, LOST, TOO_FEW, BLINDED = "tracking", "lost in space", "too few stars", "blinded"
 KEPT_NS = 10 * NS_PER_S  # frames that an exposure may still be of
@@ -52,7 +52,6 @@ SEEN_SIGMAS = 3.0  # in a pixel's noise: fainter stars are not expected in an im
 MAX_EXPECTED = 300  # brightest stars that are
 MAX_REPORTED = 30  # stars
 BLINDED_SHARE = 0.05  # detector pixels at the last code
-EVEN_DARK_DN = 1.0  # a step of the ADC, from the darkest pixel of a black screen to the brightest
 STREAK_PX = 0.5  # from this streak on, the window is as wide as it, and no S-curve is removed
 MAX_WINDOW_PX = 6.0
 # an attitude older than this predicts no other; two further apart than that tell no rate
@@ -207,24 +206,12 @@ class LiveTracker(Closing):
         self._gain_db = 0.0
         # As the bench file has them: what a client sets is worked out from these.
         self._bench_exposure_s, self._bench_under_e = self.exposure_s, self._under_e
-        self._dark_dn = self._uneven_dark_dn()
+        self._dark_dn = uneven_dark_dn(self._under_e, tracker.detector)
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
         self.refused = 0
         self.frames = WatchedFrames(self._light)
-
-    def _uneven_dark_dn(self) -> FloatArray | None:
-        """What a black screen is in the software's image (h, w), DN; None where that is even.
-
-        A screen that is seen whole glows over a part of the field, which is one large spot to a
-        tracker that takes one level for the whole image.
-        """
-        detector = self._detector.settings
-        full_dn = 2**detector.bits - 1
-        dark_dn = detector.offset_dn + self._under_e / detector.gain_e_per_dn
-        dark_dn = software_image(np.clip(dark_dn, 0.0, full_dn), detector)
-        return dark_dn if np.ptp(dark_dn) > EVEN_DARK_DN else None
 
     def _light(self, frame: ShownFrame) -> FloatArray:
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
@@ -269,7 +256,7 @@ class LiveTracker(Closing):
         gain_e_per_dn = tracker.detector.gain_e_per_dn / 10 ** (gain_db / 20)
         settings = msgspec.structs.replace(tracker.detector, gain_e_per_dn=gain_e_per_dn)
         self._detector = Detector(settings, tracker.resolution_px, tracker.pixel_pitch_um)
-        self._dark_dn = self._uneven_dark_dn()
+        self._dark_dn = uneven_dark_dn(self._under_e, settings)
 
     def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
         """The DN of an exposure."""

@@ -58,7 +58,11 @@ GOOD_OUTCOMES = (VERIFIED, BUSY, TOO_WIDE, REFUSED)
 # Refused by the first image, before anything is measured.
 BLACK_TOO_BRIGHT = "a black screen fills the tracker"
 # What `assess` says of a run of 20 s on a machine that is too busy to keep its rate.
-TOO_FEW_ANSWERS = ("missed so many frames", "valid answers, and")
+TOO_FEW_ANSWERS = (
+    "missed so many frames",
+    "valid answers, and",
+    "answers fall into the run, and",
+)
 WIDE_STAR = "star_sigma_ratio"
 FIRST_LIGHT, VERIFY, CERTIFY, SERVE, SEND, TRACKER, ASSESS = COMMANDS = (
     "first-light",

@@ -16,14 +16,14 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
 from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.basics.files import written
 from hilstar.basics.process.closing import Closing
@@ -31,6 +31,7 @@ from hilstar.basics.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.calibration import primary_lights
 from hilstar.display.identity import MonitorIdentity
+from hilstar.display.quantise import LitLight
 from hilstar.display.render.backend import ScreenView
 from hilstar.display.render.context import leave_contexts
 from hilstar.display.render.presenter import Presenter, level_texture, window_context
@@ -40,6 +41,7 @@ from hilstar.instruments.calibrate.latency import Edges, capture_edges, edges_of
 from hilstar.instruments.simulate.optics import (
     BenchGeometry,
     DisplayColours,
+    Primary,
     TwinOptics,
     seen_primaries,
 )
@@ -72,6 +74,8 @@ GRAB_TIMEOUT_S = 120.0
 STILL_S = 0.5  # a file that has not grown for so long is complete
 SWAP_JITTER_NS = 20_000
 MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
+# of their images together: eight of a whole detector of 4096 x 4096 pixels would take 0.5 GB
+MASKS_KEPT_BYTES = 128_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -701,17 +705,16 @@ class VirtualBench(ImageSource):
         self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
         self._optics = TwinOptics(self.geometry, psf)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
-        self._glow_e_per_s: FloatArray = self._mosaic.grey(self._optics.glow_e_per_s(self._panel))
+        glow_e_per_s = self._mosaic.grey(self._optics.glow_e_per_s(self._panel))
         background = TrackerBackground(config, truth.folder, self.geometry.tracker, refuse=False)
-        self._sky_e_per_s: FloatArray = background.steady_e / tracker.exposure_s
-        uniformity = (
-            1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
+        # As the detector takes it, which is half of float64: three of these are kept, of up to 16
+        # million pixels.
+        self._glow_e_per_s: Float32Array = glow_e_per_s.astype(np.float32)
+        self._sky_e_per_s: Float32Array = np.asarray(
+            background.steady_e / tracker.exposure_s, dtype=np.float32
         )
-        self._white_e_per_s: FloatArray = (
-            np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
-        )
-        self._units: dict[bytes, FloatArray] = {}
-        self._last: tuple[bytes, FloatArray] | None = None
+        self._masks = MaskImages(tracker.resolution_px, MASKS_KEPT * len(self._primaries_seen))
+        self._last: tuple[bytes, Float32Array] | None = None
         self._newest: tuple[Path, CodeImage] | None = None
         self._on_for_ns = 0
         if bench.config.render.bit_stealing:
@@ -731,7 +734,8 @@ class VirtualBench(ImageSource):
         half_ns = round(
             NS_PER_S * max(exposure_s, self.truth.config.certify.virtual.seconds_a_reading) / 2
         )
-        light = (image + self._glow_e_per_s) * self._warmth((self._on_for_ns + half_ns) / NS_PER_S)
+        light = image + self._glow_e_per_s
+        light *= np.float32(self._warmth((self._on_for_ns + half_ns) / NS_PER_S))
         self._on_for_ns += 2 * half_ns
         return self._exposed(light, exposure_s, stem)
 
@@ -765,8 +769,9 @@ class VirtualBench(ImageSource):
             file, self.truth, seconds, np.random.default_rng((self._seed, zlib.crc32(b"diode")))
         )
 
-    def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
-        mean_e = (light_e_per_s + self._sky_e_per_s) * exposure_s
+    def _exposed(self, light_e_per_s: Float32Array, exposure_s: float, stem: Path) -> Path:
+        mean_e = light_e_per_s + self._sky_e_per_s
+        mean_e *= np.float32(exposure_s)
         rng = np.random.default_rng(
             (self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode()))
         )
@@ -784,51 +789,70 @@ class VirtualBench(ImageSource):
             return self._newest[1].astype(np.float64)
         return super().pixels(path, resolution_px)
 
-    def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
+    def _image_e_per_s(self, frames: list[CodeImage]) -> Float32Array:
         """The light of frames shown in turn, on the detector (h, w); a pattern that is seen
         again is not drawn again.
         """
+        # Of 33 million pixels of an 8K screen, dots are some ten thousand.
+        lit = [lit_codes(codes) for codes in frames]
         digest = hashlib.blake2b()
-        for codes in frames:
+        for place, codes in lit:
+            digest.update(place.data)
             digest.update(codes.data)
         if self._last is not None and self._last[0] == digest.digest():
             return self._last[1]
-        lights = self._lights(frames[0])
-        if len(frames) > 1:
-            lights = np.mean([self._lights(codes) for codes in frames], axis=0)
+        lights = mean_light([self._lights(place.astype(np.intp), codes) for place, codes in lit])
         images = [self._primary_image(light, number) for number, light in enumerate(lights)]
-        image = self._mosaic.shown(np.array(images))
+        image = images[0]
+        if len(images) > 1 or self._mosaic.bayer is not None:
+            image = self._mosaic.shown(np.array(images)).astype(np.float32)
         self._last = digest.digest(), image
         return image
 
-    def _primary_image(self, light: FloatArray, number: int) -> FloatArray:
-        """The light of a primary on the detector. A pattern with one level is drawn once and
-        scaled for others.
+    def _primary_image(self, light: LitLight, number: int) -> Float32Array:
+        """The light of a primary on the detector, of lit pixels' light relative to white.
+
+        A pattern with one level is drawn once and scaled for others.
         """
-        lit, brightest, primary = light > 0, float(light.max()), self._primaries_seen[number]
+        brightest, primary = float(light.e_per_s.max(initial=0.0)), self._primaries_seen[number]
         if not brightest:
             return np.zeros_like(self._glow_e_per_s)
-        if not (light[lit] == brightest).all():
-            return self._optics.image_e_per_s(light * self._white_e_per_s, primary)
-        key = np.packbits(lit).tobytes() + bytes([number])
-        if key not in self._units:
-            if len(self._units) == MASKS_KEPT * len(self._primaries_seen):
-                del self._units[next(iter(self._units))]
-            self._units[key] = self._optics.image_e_per_s(lit * self._white_e_per_s, primary)
-        return self._units[key] * brightest
+        if not (light.e_per_s == brightest).all():
+            return self._drawn(light, primary).astype(np.float32)
+        key = hashlib.blake2b(light.place.data).digest() + bytes([number])
+        if key not in self._masks:
+            unit = LitLight(light.place, np.ones(len(light.place)))
+            self._masks.keep(key, self._drawn(unit, primary))
+        return self._masks.image(key, brightest)
 
-    def _lights(self, codes: CodeImage) -> FloatArray:
-        """Light above black of codes (h, w) or (h, w, 3), relative to white at the screen's
-        brightest place.
+    def _drawn(self, light: LitLight, primary: Primary) -> FloatArray:
+        """Light relative to white (n,) on the detector (h, w), electrons per second."""
+        white_e_per_s: FloatArray | float = self._panel.flux_at_white_e_per_s
+        if self._panel.uniformity is not None:
+            white_e_per_s = white_e_per_s * self._panel.uniformity.ravel()[light.place].astype(
+                np.float64
+            )
+        return self._optics.image_e_per_s(
+            LitLight(light.place, light.e_per_s * white_e_per_s), primary
+        )
 
-        Shape (1, h, w), or (3, h, w) where the truth drives its primaries apart.
+    def _lights(
+        self, place: IntArray, codes: npt.NDArray[np.unsignedinteger[Any]]
+    ) -> list[LitLight]:
+        """Light above black of lit pixels' codes (n,) or (n, 3), relative to white at the screen's
+        brightest place; of each primary where the truth drives them apart, else of all together.
         """
         apart = len(self._primaries_seen) > 1
-        if codes.ndim == 2 and not apart:
-            return np.asarray(self._panel.response.light[codes])[None]
-        each = np.broadcast_to(codes[..., None], (*codes.shape, 3)) if codes.ndim == 2 else codes
-        lights = np.array([self._primaries[place][each[..., place]] for place in range(3)])
-        return lights if apart else lights.sum(axis=0, keepdims=True)
+        if codes.ndim == 1 and not apart:
+            return [LitLight(place, self._panel.response.light[codes])]
+        by_primary = np.broadcast_to(codes.T, (3, len(place)))
+        lights = [
+            LitLight(place, table[its])
+            for table, its in zip(self._primaries, by_primary, strict=True)
+        ]
+        if apart:
+            return lights
+        return [LitLight(place, np.sum([light.e_per_s for light in lights], axis=0))]
 
     @cached_property
     def _primaries(self) -> FloatArray:
@@ -846,6 +870,54 @@ class VirtualBench(ImageSource):
     def close(self) -> None:
         """Free the GL context."""
         self._optics.close()
+
+
+class MaskImages:
+    """At most `count` images (h, w) of patterns with one level on a detector of `size_px` (width,
+    height), each as the rectangle that has light; the oldest go first.
+    """
+
+    def __init__(self, size_px: tuple[int, int], count: int) -> None:
+        self._shape, self._count = size_px[::-1], count
+        self._parts: dict[bytes, tuple[slice, slice, Float32Array]] = {}
+
+    def __contains__(self, key: bytes) -> bool:
+        return key in self._parts
+
+    def keep(self, key: bytes, image: FloatArray) -> None:
+        """Keep an image (h, w), in place of older ones."""
+        rows, columns = (np.flatnonzero(image.any(axis=axis)) for axis in (1, 0))
+        part = slice(0, 0), slice(0, 0)
+        if len(rows):
+            part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        self._parts[key] = *part, image[part].astype(np.float32)
+        while len(self._parts) > 1 and (
+            len(self._parts) > self._count or self._bytes() > MASKS_KEPT_BYTES
+        ):
+            del self._parts[next(iter(self._parts))]
+
+    def _bytes(self) -> int:
+        return sum(part.nbytes for _, _, part in self._parts.values())
+
+    def image(self, key: bytes, level: float) -> Float32Array:
+        """A pattern's image at a level relative to that of the image that is kept."""
+        rows, columns, part = self._parts[key]
+        image = np.zeros(self._shape, dtype=np.float32)
+        np.multiply(part, np.float32(level), out=image[rows, columns])
+        return image
+
+
+def mean_light(frames: list[list[LitLight]]) -> list[LitLight]:
+    """The mean of frames' light of each primary."""
+    if len(frames) == 1:
+        return frames[0]
+    means = []
+    for lights in zip(*frames, strict=True):
+        places = np.concatenate([light.place for light in lights])
+        place, order = np.unique(places, return_inverse=True)
+        total = np.bincount(order, np.concatenate([light.e_per_s for light in lights]))
+        means.append(LitLight(place, total / len(frames)))
+    return means
 
 
 def virtual_diode(

@@ -440,7 +440,7 @@ class Photometer:
             self.profiles[period] = lattice_profile(period, self.ratio, sigma_px)
         self.exposure_s = context.exposure_s
         self.scatter = PixelScatter(1 / context.file.config.tracker.detector.gain_e_per_dn)
-        self._dark_screen = context.take(Pattern("black_screen", black(context.resolution_px)))
+        self._dark_screen = context.take(self._black_screen(0))
         self.images = [self._dark_screen]
         self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
 
@@ -766,7 +766,7 @@ class Photometer:
         """What the cut at code 0 adds to the sum of a lattice's image above black, DN."""
         detector = self.context.file.config.tracker.detector
         stated_dn = detector.electronics_e / detector.gain_e_per_dn
-        read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
+        read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px, math.inf)
         # What is cut off scatters less than it would: the stated noise counts where it is larger.
         noise_dn = max(stated_dn, read_dn)
         dark_dn = self.scatter.dark_sum_dn(at.times) / self.field.tracker_px
@@ -776,11 +776,24 @@ class Photometer:
         cell_px = (at.period * self.ratio) ** 2
         return dots * cell_px * cut_light(level_dn, dark_dn, noise_dn, self.scatter.dn_per_e)
 
+    def _noise_dn(self, variance_dn2: float, sum_dn: float) -> float:
+        """The noise of a pixel before the ADC, DN, by the variance of the field's sum and that
+        sum.
+        """
+        detector, pixels = self.context.file.config.tracker.detector, self.field.tracker_px
+        # How far a level is above the offset, rounding tells to half a step.
+        light_dn = max(sum_dn / pixels - detector.offset_dn - HALF_STEP_DN, 0.0)
+        read_dn2 = (detector.electronics_e / detector.gain_e_per_dn) ** 2
+        stated_dn = math.sqrt(read_dn2 + light_dn / detector.gain_e_per_dn)
+        return before_adc_dn(variance_dn2 / pixels, stated_dn)
+
     def _rounded(self, at: Range, light_dn: float) -> FloatArray:
         """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the
         dark level's place.
         """
-        dark_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
+        dark_dn = self._noise_dn(
+            self.scatter.dark_dn2(at.times), self.scatter.dark_sum_dn(at.times)
+        )
         dots = self.field.lit(at.period)
         along = self.profiles[at.period]
         shares = np.outer(along, along).ravel()
@@ -803,21 +816,28 @@ class Photometer:
                 white = Patch(self.context.white, name)
                 whites.append(light[[patch == white for patch in planned]].mean())
             return light + self.assumed.black * float(np.sum(whites)), None
-        # A black screen minus one that is switched off.
-        self.images.append(unlit)
-        more = float((self._part(self._dark_screen) - self._part(unlit)).sum())
+        # A black screen minus one that is switched off. Both are in the bench file's exposure. Its
+        # noise is not that of the lattices' exposure: the black screen is taken again.
+        screens = [self._dark_screen, self.context.take(self._black_screen(1))]
+        self.images += [screens[1], unlit]
+        parts, under = [self._part(path) for path in screens], self._part(unlit)
+        glowing_dn, dark_dn = float(np.mean([part.sum() for part in parts])), float(under.sum())
+        more_dn = glowing_dn - dark_dn
         seconds = self.field.monitor_px * self.context.exposure_s
-        # Each of the two images has its noise, and is rounded; the one without glow has less noise
-        # to spread it.
-        glowing_dn2 = self.scatter.dark_dn2(1)
-        dark_dn2 = max(glowing_dn2 - self.scatter.dn_per_e * max(more, 0.0), 0.0)
-        variance = glowing_dn2 + dark_dn2
-        for image_dn2 in (glowing_dn2, dark_dn2):
-            rounding_dn = rounding_rms(before_adc_dn(image_dn2 / self.field.tracker_px))
+        # The screen that is switched off has the noise of the other, less that of the glow.
+        glowing_dn2 = float(((parts[0] - parts[1]) ** 2).sum()) / 2
+        dark_dn2 = max(glowing_dn2 - self.scatter.dn_per_e * max(more_dn, 0.0), 0.0)
+        variance = glowing_dn2 / len(parts) + dark_dn2
+        # Each of the two levels is rounded, and the one without glow has less noise to spread it.
+        for image_dn2, sum_dn in ((glowing_dn2, glowing_dn), (dark_dn2, dark_dn)):
+            rounding_dn = rounding_rms(self._noise_dn(image_dn2, sum_dn))
             variance += (self.field.tracker_px * rounding_dn) ** 2
         # The glow is over more of the screen than the dots are, by a map that has its error.
-        variance += (self._even_relative * more) ** 2
-        return light + max(more / seconds, 0.0), math.sqrt(variance) / seconds
+        variance += (self._even_relative * more_dn) ** 2
+        return light + max(more_dn / seconds, 0.0), math.sqrt(variance) / seconds
+
+    def _black_screen(self, number: int) -> Pattern:
+        return Pattern(f"black_screen_{number}", black(self.context.resolution_px))
 
     def _look(self, name: str, at: Range, patch: Patch) -> Look:
         """Show a lattice in a patch's code and look at it."""
@@ -837,7 +857,8 @@ class Photometer:
         return self.images[-1]
 
     def _part(self, path: Path) -> FloatArray:
-        return self.context.pixels(path)[self.field.rows, self.field.columns]
+        # A copy: a slice would keep its whole image, and the scatter keeps parts of a hundred.
+        return self.context.pixels(path)[self.field.rows, self.field.columns].copy()
 
 
 def _passes(patch: Patch, at: Range, link: LatticeRatio) -> bool:

@@ -18,6 +18,7 @@ from hilstar.display.calibration import (
     load_calibration,
     primary_lights,
     primary_responses,
+    read_toml,
 )
 from hilstar.display.primaries import channel_matrix
 from hilstar.display.response import Response
@@ -110,7 +111,9 @@ def photometry(context: StepContext) -> StepOutcome:
     draw_calibration(measured, picture, monitor.bits)
     written = load_calibration(output, monitor.bits)
     now = written.response
-    figures = _response_figures(context, readings, found, assumed.response, now)
+    errors = read_toml(output).errors
+    black_error = 0.0 if errors is None else errors.black
+    figures = _response_figures(context, readings, found, (assumed.response, now), black_error)
     if written.weights is not None:
         figures["shares_of_white"] = ", ".join(
             f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True)
@@ -169,8 +172,13 @@ def calibration_of(context: StepContext) -> Calibration:
 
 
 def _response_figures(
-    context: StepContext, readings: Readings, found: dict[str, Any], before: Response, now: Response
+    context: StepContext,
+    readings: Readings,
+    found: dict[str, Any],
+    responses: tuple[Response, Response],
+    black_error: float,
 ) -> dict[str, Figure]:
+    before, now = responses
     off = response_error_mag(before, now)
     held = [channel["holdout"] for channel in found["channels"].values()]
     figures: dict[str, Figure] = {
@@ -179,6 +187,7 @@ def _response_figures(
         "bench_file_off_rms_mag": float(np.sqrt((off**2).mean())),
         "bench_file_off_max_mag": float(np.abs(off).max()),
         "black_level": now.black,
+        "black_level_error": black_error,
         "black_level_in_bench_file": before.black,
         "black_level_measured": (
             "yes"
@@ -227,7 +236,12 @@ def _judged(
     limit_mag = context.file.config.verify.flux_mag
     monitor = context.file.config.monitor
     is_black_measured = figures["black_level_measured"] == "yes"
-    doubt = "" if is_black_measured else " as the bench file has it, not measured (--dark)"
+    black = f"black {figures['black_level']:.2e} of white as the bench file has it, not measured"
+    if is_black_measured:
+        black_error = figures["black_level_error"]
+        black = f"black {figures['black_level']:.2e} +- {black_error:.1e} of white"
+    else:
+        black += " (--dark)"
     line = (
         f"the bench file's {monitor.calibration} is off by {figures['bench_file_off_rms_mag']:.3f}"
         " mag rms,"
@@ -235,7 +249,7 @@ def _judged(
         f" {figures['gamma_in_bench_file']:.3f});"
         f" measured: held-out levels {figures['held_out_rms_mag']:.4f} mag rms,"
         f" {figures['held_out_max_mag']:.4f} max;"
-        f" black {figures['black_level']:.2e} of white{doubt}"
+        f" {black}"
     )
     rms_mag = float(figures["held_out_rms_mag"])
     error = rms_mag / math.sqrt(2 * float(figures["codes"]))

@@ -59,12 +59,14 @@ class StarSpot:
     """A star in the tracker's image: its sigma along x and y, tracker px, and what the detector
     adds.
 
-    The image is the mean of `frames`.
+    The image is the mean of `frames`; `electronics_dn` is the noise that the electronics add to a
+    pixel of each.
     """
 
     sigma_px: tuple[float, float]
     gain_e_per_dn: float
     prnu: float
+    electronics_dn: float
     frames: int = 1
 
     @classmethod
@@ -83,7 +85,8 @@ class StarSpot:
             math.hypot(own * a, b) for a, b in zip(context.tracker_psf.width_px, drawn, strict=True)
         )
         detector = context.file.config.tracker.detector
-        return cls((x, y), detector.gain_e_per_dn, detector.prnu)
+        gain_e_per_dn = detector.gain_e_per_dn
+        return cls((x, y), gain_e_per_dn, detector.prnu, detector.electronics_e / gain_e_per_dn)
 
     @property
     def mean_sigma_px(self) -> float:
@@ -154,7 +157,7 @@ class StarSpot:
         in the mean of the frames.
         """
         shares, _ = self._shares
-        dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2)
+        dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2, self.electronics_dn)
         rounded = np.zeros((len(dn), STEP_PHASES))
         for star, light_dn in enumerate(dn.tolist()):
             rounded[star] = rounded_light(

@@ -4,7 +4,7 @@ screen.
 
 import datetime
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from hilstar.instruments.calibrate.warm_up import (
     judge_warm_up,
     watch_white,
 )
+from hilstar.instruments.simulate.optics import PIXELS_AT_ONCE, BenchGeometry
 from hilstar.server.bench.build import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
 
@@ -372,7 +373,9 @@ def _unsaturated(
         looks: list[DarkSubtracted] = []
         for number, firsts in enumerate(lattices):
             codes = _shown(firsts, period, code, context.resolution_px)
-            looks.append(context.look(Pattern(f"{name}_{code:05}_{number:03}", codes), dark))
+            looked = context.look(Pattern(f"{name}_{code:05}_{number:03}", codes), dark)
+            # DN are whole numbers: half of float64 for four images of up to 16 million pixels.
+            looks.append(replace(looked, image=looked.image.astype(np.float32)))
             if context.is_too_bright(looks[-1]):
                 break
         else:
@@ -388,9 +391,6 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     sigma_px, period, reach = _spacing(context)
-    width, height = geometry.tracker.resolution_px
-    y, x = np.mgrid[0:height, 0:width]
-    seen = np.stack(geometry.to_monitor(x.ravel().astype(np.float64), y.ravel().astype(np.float64)))
     dark_path = context.dark()
     dark = context.read(dark_path)
     bad = dark > HOT_FILL * context.full_dn
@@ -398,16 +398,14 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     bad[[0, -1]], bad[:, [0, -1]] = True, True
     lattices = [[period // 2 + period // 2 * half for half in shift] for shift in SHIFTS]
     _, looks = _unsaturated(context, dark, "lattice", lattices, period)
-    parts, noise_dn = [], 0.0
+    noise_dn = noisiest_background(looks[-1].image).noise
     size = np.array(context.resolution_px)
-    for firsts, looked in zip(lattices, looks, strict=True):
-        noise_dn = noisiest_background(looked.image).noise
-        first = np.array(firsts)
-        parts.append(
-            _sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size)
-        )
+    sums = [LatticeSums(np.array(firsts), period, reach, size) for firsts in lattices]
+    images = [looked.image for looked in looks]
+    _add_rows(geometry, sums, images, bad)
     paths = [dark_path, *(looked.path for looked in looks)]
-    columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
+    whole = [lattice.whole() for lattice in sums]
+    columns, rows, light = (np.concatenate(part) for part in zip(*whole, strict=True))
     lit = light > 0
     if lit.sum() < MIN_DOTS:
         few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
@@ -439,37 +437,53 @@ class DotSums(NamedTuple):
     light: FloatArray
 
 
-def _sums(
-    looked_at: FloatArray,
-    image: FloatArray,
-    bad: BoolArray,
-    *,
-    firsts: IntArray,
-    period: int,
-    reach: float,
-    size: IntArray,
-) -> DotSums:
-    """The dots without a bad pixel in reach, and the sum of the image (h, w) in reach of each.
-
-    `looked_at` (2, h * w) is where each pixel looks on the monitor of `size`, px, whose dots are
-    every `period` from `firsts`.
+class LatticeSums:
+    """Sums of the light in reach of a lattice's dots on a monitor of `size`, px: one every
+    `period` from `firsts` (x, y) on.
     """
-    counts = (size - firsts - DOT_PX // 2 - 1) // period + 1
-    place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / period
-    nearest = np.rint(place)
-    inside = (nearest >= 0).all(axis=0) & (nearest[0] < counts[0]) & (nearest[1] < counts[1])
-    inside &= np.hypot(*(place - nearest)) * period <= reach
-    index = (nearest[1][inside] * counts[0] + nearest[0][inside]).astype(np.intp)
-    total = counts[0] * counts[1]
-    light = np.asarray(np.bincount(index, image.ravel()[inside], minlength=total), dtype=np.float64)
-    whole = np.bincount(index, minlength=total) > 0
-    whole &= np.bincount(index, bad.ravel()[inside], minlength=total) == 0
-    which = np.flatnonzero(whole)
-    return DotSums(
-        firsts[0] + which % counts[0] * period,
-        firsts[1] + which // counts[0] * period,
-        light[which],
-    )
+
+    def __init__(self, firsts: IntArray, period: int, reach: float, size: IntArray) -> None:
+        self._firsts, self._period, self._reach = firsts, period, reach
+        self._counts = (size - firsts - DOT_PX // 2 - 1) // period + 1
+        total = int(self._counts[0] * self._counts[1])
+        self._light, self._pixels, self._bad = (np.zeros(total) for _ in range(3))
+
+    def add(self, looked_at: FloatArray, image: FloatArray, bad: BoolArray) -> None:
+        """Add pixels (n,) of the tracker, which look at places (2, n) on the monitor, px."""
+        firsts, counts, total = self._firsts, self._counts, len(self._light)
+        place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / self._period
+        nearest = np.rint(place)
+        inside = (nearest >= 0).all(axis=0) & (nearest[0] < counts[0]) & (nearest[1] < counts[1])
+        inside &= np.hypot(*(place - nearest)) * self._period <= self._reach
+        index = (nearest[1][inside] * counts[0] + nearest[0][inside]).astype(np.intp)
+        self._light += np.bincount(index, image[inside], minlength=total)
+        self._pixels += np.bincount(index, minlength=total)
+        self._bad += np.bincount(index, bad[inside], minlength=total)
+
+    def whole(self) -> DotSums:
+        """The dots without a bad pixel in reach."""
+        which = np.flatnonzero((self._pixels > 0) & (self._bad == 0))
+        return DotSums(
+            self._firsts[0] + which % self._counts[0] * self._period,
+            self._firsts[1] + which // self._counts[0] * self._period,
+            self._light[which],
+        )
+
+
+def _add_rows(
+    geometry: BenchGeometry, sums: list[LatticeSums], images: list[FloatArray], bad: BoolArray
+) -> None:
+    """Add the image (h, w) of each lattice to its sums, some rows at a time: where all pixels
+    look, and what follows from it, took 1 GB of 5 million.
+    """
+    width, height = geometry.tracker.resolution_px
+    rows = max(1, PIXELS_AT_ONCE // width)
+    for top in range(0, height, rows):
+        part = slice(top, min(top + rows, height))
+        y, x = np.mgrid[part, 0:width].astype(np.float64)
+        looked_at = np.stack(geometry.to_monitor(x.ravel(), y.ravel()))
+        for lattice, image in zip(sums, images, strict=True):
+            lattice.add(looked_at, image[part].ravel(), bad[part].ravel())
 
 
 def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> UniformityMap:

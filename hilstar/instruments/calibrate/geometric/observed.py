@@ -162,8 +162,9 @@ def _centroids(
             f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the"
             " dots darker"
         )
-    above = image if under is None else image - under
-    found = find_stars(above, settings, noisiest_background(above))
+    if under is not None:
+        image = image - under
+    found = find_stars(image, settings, noisiest_background(image))
     kept = ~found.at_edge
     return found.x_px[kept], found.y_px[kept]
 

@@ -370,7 +370,7 @@ def test_the_noise_of_wide_stars_is_known_in_place_and_light():
     the geometry.
     """
     spot, rng, dn, noise_dn = (
-        StarSpot((4.0, 4.0), 2.0, 0.0),
+        StarSpot((4.0, 4.0), 2.0, 0.0, 3.0),
         np.random.default_rng(4),
         20_000.0,
         3.0,
@@ -393,7 +393,7 @@ def test_the_noise_of_a_whole_catalogue_s_stars_is_that_of_each_and_takes_no_min
     """Fields of 0.9 degrees wanted stars to 9.5 mag, and each star's rounding by itself took
     three minutes before the first one was shown.
     """
-    spot, noise_dn, largest_dn = StarSpot((2.6, 2.6), 11.2, 0.005), 0.42, 60_000.0
+    spot, noise_dn, largest_dn = StarSpot((2.6, 2.6), 11.2, 0.005, 0.42), 0.42, 60_000.0
     few_dn = np.array([5.3, 31.7, 512.9, 8123.4])
     each_mag = spot.light_noise_mag(few_dn, noise_dn)
     rounded = []

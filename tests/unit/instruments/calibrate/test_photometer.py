@@ -9,6 +9,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
 from hilstar.display.calibration import (
@@ -30,7 +31,7 @@ from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
 from hilstar.instruments.simulate.optics import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.tracker.rounding import cut_light, rounding_error, rounding_rms
+from hilstar.tracker.rounding import before_adc_dn, cut_light, rounding_error, rounding_rms
 from tests.support.benches import TWIN, bench_text
 
 pytestmark = pytest.mark.usefixtures("without_charts")
@@ -250,6 +251,25 @@ def test_rounding_is_that_of_levels_in_noise():
         )
     assert rounding_rms(0.0) == pytest.approx(1 / math.sqrt(12), rel=0.04)
     assert rounding_rms(0.6) < 1e-3
+
+
+@pytest.mark.parametrize("noise_dn", [0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7])
+def test_no_level_is_rounded_by_far_more_than_the_noise_of_its_readings_says(noise_dn):
+    """A level half way between two codes scatters by half a DN with hardly any noise. Taken for
+    noise that spreads it over the steps, it gave a black level that was 5 of its sigmas off.
+    """
+    # An error of rounding is at most sqrt 3 times its rms over the levels, a sawtooth's.
+    largest_of_rms, codes = math.sqrt(3), np.arange(-8, 10)
+    for level in np.linspace(0, 1, 41):
+        below = ndtr((codes[:, None] + np.array([-0.5, 0.5]) - level) / noise_dn)
+        share = np.diff(below, axis=1)[:, 0]
+        mean = float(share @ codes)
+        variance = float(share @ (codes - mean) ** 2)
+        found_dn = before_adc_dn(variance, stated_dn=noise_dn)
+        assert abs(mean - level) < 1.05 * largest_of_rms * rounding_rms(found_dn) + 1e-4
+        assert before_adc_dn(variance, math.inf) == math.sqrt(max(variance - 1 / 12, 0))
+    # Noise that spreads a level is found by its readings, whatever is stated.
+    assert before_adc_dn(0.7**2 + 1 / 12, stated_dn=0.1) == pytest.approx(0.7)
 
 
 @pytest.mark.parametrize(

@@ -18,18 +18,20 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[1]
 # pages of the site, and the files that they are
 ADDED = {"changes.md": "CHANGELOG.md", "examples.md": "examples/README.md"}
+PICTURE = "readme.png"  # beside the README, and on the site
 # its words may have brackets
 LINK = re.compile(r"(?<!!)\[((?:[^\]\[]|\[[^\]\[]*\])+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages that lie elsewhere in the checkout."""
+    """Add the pages, and the picture, that lie elsewhere in the checkout."""
     from mkdocs.structure.files import File  # which the tests of the rest do without
 
     for page, path in ADDED.items():
         files.append(
             File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8"))
         )
+    files.append(File.generated(config, PICTURE, content=(ROOT / PICTURE).read_bytes()))
     return files
 
 
@@ -53,4 +55,4 @@ def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
             return f"[{text}]({site}{heading})"
         return f"`{path}`" if path.endswith(text.strip("`")) else f"{text} (`{path}`)"
 
-    return LINK.sub(linked, markdown)
+    return LINK.sub(linked, markdown).replace(f"](../{PICTURE})", f"]({PICTURE})")

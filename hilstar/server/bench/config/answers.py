@@ -84,7 +84,7 @@ class AnswersSettings(Table, frozen=True):
     ] = "packet"
     #: `"python:..."`: installed packages that MODULE may belong to, as well as to the bench file's
     #: folder (see
-    #: [what runs](what-runs.md)).
+    #: [what runs](bench-pc.md#what-a-file-can-run)).
     trust: Annotated[tuple[str, ...], Meta(extra={"form": '["PACKAGE", ...]'})] = ()
     #: ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`,
     #: another way to write `bind`. Default: `tcp://127.0.0.1:5562` for ZeroMQ

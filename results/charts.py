@@ -117,18 +117,16 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
             xscale="log",
         )
         at, ms = points("hours", "time")
-        hours.plot(at, [value / 1e3 for value in ms], "o-", color=RED, label="processor time [s]")
-        hours.plot(
-            at, points("hours", "memory_mb")[1], "o-", color=PURPLE, label="peak of memory [MB]"
-        )
+        hours.plot(at, [value / 1e3 for value in ms], "o-", color=RED)
+        memory_mb = points("hours", "memory_mb")[1]
         hours.set(
-            title="report: 60 frames and packets a second",
-            xlabel="hours of the run",
-            ylabel="s, or MB",
+            title=f"report, in {min(memory_mb):.0f} to {max(memory_mb):.0f} MB",
+            xlabel="hours of the run, 60 frames and packets a second",
+            ylabel="processor time [s]",
         )
         for axes in (stars, pixels, workers, hours):
             axes.set(xscale="log", yscale="log")
-        for axes in (stars, memory, workers, hours):
+        for axes in (stars, memory, workers):
             axes.legend(
                 fontsize="small", loc="upper left" if axes in (stars, memory) else "lower right"
             )

@@ -141,14 +141,16 @@ def bench() -> str:
     d.parts.append('<rect x="610" y="96" width="96" height="80" rx="8" class="box"/>')
     d.parts.append('<rect x="596" y="112" width="14" height="48" class="box"/>')
     d.text(658, 134, "tracker", "middle head")
-    d.text(658, 134 + LINE_PX, "at infinity", "middle note")
-    # one star: a pixel of the monitor lights the whole lens
-    for y0, y1 in ((116, 78), (116, 136), (116, 194)):
-        d.line((74, y0), (404, y1), kind="ray")
-    # parallel behind the lens, in the direction from the pixel to the lens's middle
+    d.text(658, 134 + LINE_PX, "focused", "middle note")
+    d.text(658, 134 + 2 * LINE_PX - 3, "at infinity", "middle note")
+    # one star: rays of a pixel leave the lens in the direction from the pixel to the lens's middle
     slope = 20 / 330
-    for y1 in (98, 118, 136):
-        d.arrow((404, y1), (594, y1 + slope * 190), kind="ray", tip="raytip")
+    for y1 in (86, 104, 122, 140, 176):
+        end = (594, y1 + slope * 190)
+        if 112 < end[1] < 160:
+            d.arrow((74, 116), (404, y1), end, kind="ray", tip="raytip")
+        else:
+            d.line((74, 116), (404, y1), end, kind="ray")
     d.parts.append('<circle cx="84" cy="196" r="5" class="light"/>')
     d.line((84, 201), (84, 222), (150, 222))
     d.text(156, 226, "photodiode, on a square of the screen’s corner (step 3)", "note")
@@ -201,7 +203,7 @@ def packet_life() -> str:
 
 
 def heads() -> str:
-    """heads.md: several heads, one attitude."""
+    """bench-pc.md: several heads, one attitude."""
     d = Drawing(
         "One source of the body's attitude; a process, a monitor, a ledger and a page for each"
         " head",
@@ -227,7 +229,7 @@ def heads() -> str:
 
 
 def separated() -> str:
-    """error-budget.md: what an answer's error is separated into."""
+    """answers.md: what an answer's error is separated into."""
     d = Drawing(
         "What the error of an answer is separated into: clock, bias, field-of-view error, pixel"
         " error, noise",
@@ -253,7 +255,7 @@ def separated() -> str:
 
 
 def theory_bench() -> str:
-    """theory-bench.md: the bench with its frames' axes and pixels."""
+    """theory.md: the bench with its frames' axes and pixels."""
     d = Drawing(
         "The bench and its frames: monitor pixels, cam and mon axes, the tracker's pixels, the sky"
         " at infinity",
@@ -278,11 +280,9 @@ def theory_bench() -> str:
     d.parts.append('<rect x="620" y="82" width="84" height="76" rx="8" class="box"/>')
     d.parts.append('<rect x="606" y="96" width="14" height="48" class="box"/>')
     d.text(665, 62, "tracker", "middle head")
-    for y1 in (84, 120, 156):
-        d.line((272, 100), (452, y1), kind="ray")
-    slope = 20 / 180
-    for y1 in (96, 108, 120):
-        d.arrow((452, y1), (604, y1 + slope * 152), kind="ray", tip="raytip")
+    slope = 20 / 180  # from the pixel to the lens's middle: the direction behind the lens
+    for y1 in (86, 104, 122):
+        d.arrow((272, 100), (452, y1), (604, y1 + slope * 152), kind="ray", tip="raytip")
     d.arrow((665, 120), (560, 120), kind="line", tip="tip")
     d.text(496, 176, "+z boresight", "note")
     d.line((530, 164), (566, 124), kind="line dash")
@@ -315,7 +315,7 @@ def theory_bench() -> str:
 
 
 def theory_light() -> str:
-    """theory-light.md: from a catalogue's magnitude to the light that the tracker receives."""
+    """theory.md: from a catalogue's magnitude to the light that the tracker receives."""
     d = Drawing(
         "The light chain: magnitude and colour, electron rate, sprite, linear image, level, code,"
         " light, tracker",
@@ -364,7 +364,7 @@ def theory_light() -> str:
 
 
 def theory_frame() -> str:
-    """theory-frame.md: packets, clocks and frames on one axis of time."""
+    """theory.md: packets, clocks and frames on one axis of time."""
     d = Drawing(
         "The frame loop in time: packets, offset, prediction, drawing, swap, scan-out, light, over"
         " three refreshes",

@@ -68,13 +68,11 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     full_well_e: Charge = 70_000.0  #: Charge above this is lost, or spills with `blooming`.
     bits: Annotated[int, Meta(ge=1, le=16)] = 12  #: Bits of a DN.
     offset_dn: Amount = 0.0  #: Added by the ADC.
-    #: Colours of the pixels, each row of two from the top left: `"rggb"` has red in pixel (0, 0).
-    #: It needs `[tracker] quantum_efficiency_r`, `_g` and `_b`, each that of the pixels of its
-    #: colour ([colour](colour.md)). Default: no mosaic: mono
+    #: Colours of the pixels, two rows from the top left: `"rggb"` has red in pixel (0, 0). Needs
+    #: three quantum efficiencies ([colour](colour.md)). Default: no mosaic: mono
     bayer: Literal["rggb", "bggr", "grbg", "gbrg"] | None = None
-    #: With `bayer`, where `hilstar tracker` and the solvers of `campaign` find stars.
-    #: `"superpixel"`: the mean of the four squares of 2 x 2 that a pixel belongs to. `"mosaic"`:
-    #: the raw pixels. Places are those of the whole mosaic either way.
+    #: With `bayer`, what the solvers get: `"superpixel"`, the mean of the four squares of 2 x 2
+    #: around a pixel, or `"mosaic"`, the raw pixels.
     solver_image: Literal["superpixel", "mosaic"] = "superpixel"
     #: Share of a pixel that takes light: `quantum_efficiency` is that of its open part.
     fill_factor: Annotated[float, Meta(ge=1e-3, le=1)] = 1.0

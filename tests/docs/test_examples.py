@@ -39,14 +39,18 @@ PAGES += [ROOT / "firmware_protocol" / "README.md", ROOT / "CONTRIBUTING.md"]
 EXAMPLES = {page: blocks for page in PAGES if (blocks := blocks_of(page.read_text()))}
 # no other shell's name: a console block is run
 LANGUAGES = {"console", "python", "toml", "json", "text", "c"}
-DEFAULT_PORT = "5560"
+# of the attitude, a run's frames, a tracker's answers, and the operator's page
+DEFAULT_PORTS = ("5560", "5570", "5580", "8765")
 LISTEN = "0A"  # a state of /proc/net/tcp
 
 
+Ports = dict[str, str]
+
+
 @pytest.fixture
-def port() -> str:
-    """A free port in the place of the default one, so that pages may be tested side by side."""
-    return str(free_port())
+def ports() -> Ports:
+    """A free port in the place of each default one, so that pages may be tested side by side."""
+    return {default: str(free_port()) for default in DEFAULT_PORTS}
 
 
 @pytest.fixture
@@ -58,37 +62,45 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("page", EXAMPLES, ids=[str(page.relative_to(ROOT)) for page in EXAMPLES])
-def test_the_examples_do_what_the_page_says(page, folder, port):
+def test_the_examples_do_what_the_page_says(page, folder, ports):
     names: dict[str, Any] = {"__name__": "__main__"}
     for block in EXAMPLES[page]:
         try:
-            follow(block, folder, port, names)
+            follow(block, folder, ports, names)
         except BaseException as error:
             error.add_note(f"{page.relative_to(ROOT)}:{block.line}")
             raise
 
 
-def follow(block: Block, folder: Path, port: str, names: dict[str, Any]) -> None:
+def follow(block: Block, folder: Path, ports: Ports, names: dict[str, Any]) -> None:
     """Do with a block what its reader does."""
     if block.title is not None:
-        (folder / block.title).write_text(with_port(block, port))
+        (folder / block.title).write_text(file_text(block, ports))
     if block.not_run is not None:
         return
     if block.language == "console":
-        type_in(block, port)
+        type_in(block, ports)
     elif block.language == "python" and block.title is None:
-        exec(compile(block.text.replace(DEFAULT_PORT, port), f"line {block.line}", "exec"), names)
+        exec(compile(with_ports(block.text, ports), f"line {block.line}", "exec"), names)
     elif block.language == "toml":
         read_toml(block.text, folder)
     elif block.language == "json":
         json.loads(block.text)
 
 
-def with_port(block: Block, port: str) -> str:
+def with_ports(text: str, ports: Ports) -> str:
+    """A text with the page's own ports in the place of the default ones."""
+    for default, port in ports.items():
+        text = text.replace(f":{default}", f":{port}")
+    return text
+
+
+def file_text(block: Block, ports: Ports) -> str:
     """The text of a file; a bench file listens on the page's own port."""
-    text = block.text.replace(DEFAULT_PORT, port)
-    if block.title == "bench.toml" and "[attitude]" not in text:
-        text += f'[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n'
+    text = with_ports(block.text, ports)
+    is_bench = (block.title or "").endswith(".toml") and "[monitor]" in text
+    if is_bench and "[attitude]" not in text:
+        text += f'[attitude]\nendpoint = "tcp://127.0.0.1:{ports["5560"]}"\n'
     return text
 
 
@@ -113,13 +125,16 @@ def read_toml(text: str, folder: Path) -> None:
     read_config(path)
 
 
-def type_in(block: Block, port: str) -> None:
+def type_in(block: Block, ports: Ports) -> None:
     """Run the commands of a console block and compare what they print."""
+    port = ports["5560"]
     with contextlib.ExitStack() as beside:
         for step in block.steps:
-            words = shlex.split(step.command.replace(DEFAULT_PORT, port))
+            words = shlex.split(with_ports(step.command, ports))
             if words[:2] == ["hilstar", "send"] and "--to" not in words:
                 words += ["--to", f"tcp://127.0.0.1:{port}"]
+            if words[0] == "hilstar" and words[-1] == "--console":
+                words.append(f"127.0.0.1:{ports['8765']}")
             # each worker is a process, which takes a second to start
             if words[:2] == ["hilstar", "campaign"]:
                 words += ["--workers", "1"]
@@ -159,8 +174,9 @@ def other_program(words: list[str]) -> str:
 
 @contextlib.contextmanager
 def running(words: list[str]) -> Iterator[None]:
-    """A hilstar command beside the others, until the block is done."""
-    with Started([sys.executable, "-m", *words], stdout=subprocess.DEVNULL) as process:
+    """A hilstar command, or a script of the page's, beside the others until the block is done."""
+    command = words[1:] if words[0] == "python" else ["-m", *words]
+    with Started([sys.executable, *command], stdout=subprocess.DEVNULL) as process:
         try:
             yield
         finally:

@@ -3,7 +3,7 @@ they are loaded.
 
 A bench file comes from other people, too. One that could name any module would run a shell:
 `python:os:system` does. So the module is a file beside the one that names it, which whoever took
-the folder could read, or belongs to a package that the bench file trusts by name. docs/what-runs.md
+the folder could read, or belongs to a package that the bench file trusts by name. docs/bench-pc.md
 says what that means.
 """
 

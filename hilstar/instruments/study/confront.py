@@ -145,6 +145,20 @@ def line_of(row: PhotographFound) -> str:
     )
 
 
+def short_name(row: PhotographFound, rows: Sequence[PhotographFound]) -> str:
+    """The words of an image's name that not all images of its camera share, whole."""
+    words = Path(row.image).stem.split("_")
+    others = [
+        set(Path(other.image).stem.split("_"))
+        for other in rows
+        if other.camera == row.camera and other.image != row.image
+    ]
+    if not others:
+        return " ".join(words)
+    shared = set.intersection(*others)
+    return " ".join(word for word in words if word not in shared)
+
+
 def draw(path: Path, found: Sequence[PhotographFound]) -> None:
     """Bars of what is left of places and light in each image, and points of what is left when it
     is held out.
@@ -162,7 +176,7 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
     with chart(
         path, finding, 1, 2, note=note, share_x=False, height_inch=1.6 + 0.3 * len(rows)
     ) as panels:
-        for axes, kind, unit in zip(panels, ("px", "mag"), ("px an axis", "mag"), strict=True):
+        for axes, kind, unit in zip(panels, ("px", "mag"), ("px per axis", "mag"), strict=True):
             axes.barh(places, [getattr(row, f"rms_{kind}") for row in rows], color=BLUE, height=0.6)
             axes.plot(
                 [getattr(row, f"held_out_{kind}") for row in rows], places, "o", color=ORANGE, ms=5
@@ -170,5 +184,5 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
             axes.set(xlabel=f"rms [{unit}]", xlim=(0, None))
             axes.set_yticks(places, [])
             axes.invert_yaxis()
-        labels = [f"{row.camera}, {Path(row.image).stem[-14:]}" for row in rows]
+        labels = [f"{row.camera}, {short_name(row, rows)}" for row in rows]
         panels[0].set_yticks(places, labels, fontsize=SMALL_PT, color=MUTED)

@@ -1,4 +1,4 @@
-"""What the page's server and a browser say to each other, as JSON: `docs/console-server.md` has the
+"""What the page's server and a browser say to each other, as JSON: `docs/console.md` has the
 same for a reader.
 
 `tools/make_page_protocol.py` makes the page's constants (`page/protocol.js`) from this file.

@@ -115,7 +115,7 @@ def test_a_run_is_ready_with_its_first_frame_and_alive_while_frames_go_on(system
 
 @pytest.mark.timing
 def test_killed_and_started_again_it_shows_frames_within_three_seconds(systemd):
-    """In time of a free core: on a busy machine everything takes longer. docs/console-server.md
+    """In time of a free core: on a busy machine everything takes longer. docs/console.md
     has what the clock says.
     """
     with systemd.started() as process:

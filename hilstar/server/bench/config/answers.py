@@ -76,15 +76,15 @@ class AnswersSettings(Table, frozen=True):
     #: The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something
     #: appends: what is appended after the start counts.
     source: Literal["serial", "udp", "tcp", "zmq", "file"]
-    #: `"packet"`: hilstar's own (kind 5), as COBS frames over serial lines, TCP and files.
-    #: `"json"`: an object a line or a message. `"frame"`: the tracker's own telemetry, declared by
-    #: the keys below. `"python:MODULE:FUNCTION"`: bytes in, answers out.
+    #: `"packet"`: hilstar's own (kind 5). `"json"`: an object a line or a message. `"frame"`:
+    #: declared by the keys below. `"python:..."`: bytes in, answers out ([what
+    #: runs](bench-pc.md#what-a-file-can-run)).
     format: Annotated[
         str, Meta(extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'})
     ] = "packet"
     #: `"python:..."`: installed packages that MODULE may belong to, as well as to the bench file's
     #: folder (see
-    #: [what runs](what-runs.md)).
+    #: [what runs](bench-pc.md#what-a-file-can-run)).
     trust: Annotated[tuple[str, ...], Meta(extra={"form": '["PACKAGE", ...]'})] = ()
     #: ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`,
     #: another way to write `bind`. Default: `tcp://127.0.0.1:5562` for ZeroMQ
@@ -126,9 +126,8 @@ class AnswersSettings(Table, frozen=True):
     latency_ms: NotNegative | None = None
     #: An answer further than this from what was lit is a wrong one.
     wrong_arcsec: Positive = 3600.0
-    #: How frames are told apart. `"sync"`: by `sync_hex`. `"slip"` (RFC 1055), `"cobs"`. `"fixed"`:
-    #: each as long as `length`. `"ccsds"`: Space Packets (133.0-B), by the length in their header.
-    #: Default: none; required for frame
+    #: How frames are told apart: by `sync_hex`; SLIP (RFC 1055); COBS; all of one `length`; or
+    #: CCSDS Space Packets (133.0-B). Default: none; required for frame
     framing: Literal["sync", "slip", "cobs", "fixed", "ccsds"] | None = None
     #: The bytes with which a frame begins. Default: none
     sync_hex: Annotated[HexBytes | None, Meta(extra={"form": '"1A CF"'})] = None

@@ -36,39 +36,29 @@ PACKET_SOURCES = ("zmq", "serial", "udp")
 class AttitudeSettings(Table, frozen=True):
     """Where the attitude comes from, and what is shown without one."""
 
-    #: `"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a
-    #: packet or JSON in each datagram. `"vizard"`: Basilisk's Vizard stream, and `"42"`: the text
-    #: stream of NASA's 42; their attitude is the body's (`[tracker] q_body_to_cam`). `"scpi"`:
-    #: `SKY:ATT` and `SKY:RATE` of a test stand (`hilstar serve --scpi`), with no other key of a
-    #: source.
+    #: `"zmq"` and `"udp"`: packets or JSON. `"serial"`: COBS frames. `"vizard"` (Basilisk) and
+    #: `"42"`: a body's attitude ([sources](sources.md)). `"scpi"`: a [test stand](scpi.md).
     source: Literal["zmq", "serial", "udp", "vizard", "42", "scpi"] = "zmq"
-    #: ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`,
-    #: where HOST is an IPv4 address, an IPv6 address in brackets, or a name (when hilstar binds
-    #: also `*`, and PORT may be `*` for a free one, which is then reported), or
-    #: `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this machine. UDP:
-    #: `udp://ADDRESS:PORT`, another way to write `bind`. 42: where its socket is, when it is the
-    #: server. Default: `tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep
-    #: `tcp://127.0.0.1:5556`; of 42 `tcp://127.0.0.1:10001`
+    #: Where hilstar's SUB connects: `tcp://HOST:PORT` (bound also `*`) or `ipc:///WHOLE/PATH`. UDP:
+    #: `udp://ADDRESS:PORT`, as `bind`. 42: its socket, as the server. Default:
+    #: `tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`;
+    #: of 42 `tcp://127.0.0.1:10001`
     endpoint: str | None = None
-    #: ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address
-    #: and port listened on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one,
-    #: which is reported). Default: `false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP
+    #: `true` when hilstar binds and the sender connects. UDP: what it listens on, `"ADDRESS"`,
+    #: `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: any). Default: `false`; `true` in lockstep;
+    #: `"127.0.0.1:5560"` over UDP
     bind: bool | str | None = None
-    #: UDP, and 42 where hilstar binds: who may send: addresses and networks, such as
-    #: `["192.168.1.20", "fd00::/64"]`. What others send is counted, and never answered. Default:
-    #: this machine; required where `bind` is not loopback
+    #: UDP, and 42 where hilstar binds: addresses and networks that may send, such as
+    #: `["192.168.1.20", "fd00::/64"]`. Default: this machine; required where `bind` is not loopback
     allow: Annotated[tuple[str, ...], Meta(extra={"form": '["ADDRESS", ...]'})] = ()
-    #: ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one
-    #: reply, at whatever speed the sender has. Vizard: `true` for Basilisk's live stream instead of
-    #: its broadcast; hilstar stands in Vizard's place, and Basilisk's cameras get pictures of the
-    #: virtual tracker. 42: `true` to acknowledge each message once its frame is out, so that 42 may
-    #: run as fast as it can.
+    #: ZeroMQ: a REP socket; each request is one attitude, one frame, one reply. Vizard: Basilisk's
+    #: live stream, in Vizard's place. 42: each message is acknowledged when its frame is out.
     lockstep: bool = False
     #: Vizard: the name of the spacecraft that carries the tracker. 42: its number, such as
     #: `"SC[0]"`. Default: the only one that is there; `"SC[0]"`
     spacecraft: str | int | None = None
-    #: Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It
-    #: adds to `[sky] observer_velocity_km_s`, which is then that of the origin of Basilisk's frame.
+    #: Vizard: whether the spacecraft's velocity aberrates the stars (5 arcsec in low orbit), beside
+    #: the origin's.
     use_velocity: bool = True
     convention: Convention = HILSTARS
     #: ZeroMQ: the file of hilstar's own secret key. Default: none
@@ -87,10 +77,9 @@ class AttitudeSettings(Table, frozen=True):
     #: Serial and UDP: ask the sender for its time. A sender that does not answer is followed by its
     #: packets alone.
     time_requests: bool = True
-    #: `"estimated"`: the offset of the sender's clock is estimated. `"shared"`: the sender runs on
-    #: this machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is
-    #: absolute. `"unix"`: `t_ns` is Unix time of a machine that PTP or NTP disciplines, as this
-    #: one; the offset is that of this machine's own clock, with the error that its kernel states.
+    #: `"estimated"`: the sender's clock is fitted. `"shared"`: `t_ns` is this machine's
+    #: CLOCK_MONOTONIC. `"unix"`: Unix time of a machine disciplined by PTP or NTP
+    #: ([time](attitude-in.md#time)).
     clock: Literal["estimated", "shared", "unix"] = "estimated"
     #: The age at which an attitude counts as stale; below half of that it counts as fresh again.
     stale_after_ms: NotNegative = 250.0
@@ -99,20 +88,16 @@ class AttitudeSettings(Table, frozen=True):
     max_extrapolation_ms: NotNegative = 250.0
     #: What is shown while the attitude is stale. `"hold"`: the last attitude. `"blank"`: no stars.
     on_stale: Literal["hold", "blank"] = "hold"
-    #: A packet or a log entry with a faster rate is refused (reason `rate`; rates in packets are
-    #: rad/s), and two samples that would need a faster turn between them are a jump, never a turn.
+    #: A faster rate is refused (reason `rate`; rates in packets are rad/s); two samples that would
+    #: need a faster turn are a jump.
     max_rate_deg_s: Annotated[float, Meta(ge=1e-3, le=1e9)] = 60.0
-    #: How the newest attitude is carried on to the moment of light. `"rate"`: by its rate, which is
-    #: exact for a steady turn and amplifies jitter from about 0.3 / age on (15 Hz at 20 ms).
-    #: `"auto"`: a steady turn as before, and of the jitter as much as the last second's samples
-    #: show to go on ([On time](on-time.md#prediction-and-jitter)).
+    #: How the newest attitude is carried on to the moment of light. `"rate"`: by its rate.
+    #: `"auto"`: with as much of its jitter as persists ([On
+    #: time](on-time.md#prediction-and-jitter)).
     prediction: Literal["rate", "auto"] = "rate"
-    #: Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes
-    #: or frame, by a factor, late, or zero) are reported (`rates-wrong`), and quaternions that
-    #: rates show to be of another convention (`convention-wrong`). `"use-quaternions"`: and the sky
-    #: is drawn by the quaternions' own turn until the rates are right. `"warn"`: they are used all
-    #: the same. `"off"`: nothing is compared. At rest nothing can be told. A log's rates are used
-    #: only where they fit its attitudes.
+    #: Rates that are not the turn of the packets' own quaternions are reported.
+    #: `"use-quaternions"`: the sky then follows the quaternions. `"warn"`: the rates. `"off"`:
+    #: nothing is compared ([rates](attitude-in.md#rates)).
     check_rates: Literal["use-quaternions", "warn", "off"] = "use-quaternions"
 
     @property

@@ -60,11 +60,8 @@ Offset = tuple[Annotated[float, Meta(ge=-1, le=1)], Annotated[float, Meta(ge=-1,
 class TrackerOptics(Table, frozen=True):
     """How the tracker's lens spreads a star over the detector."""
 
-    #: `"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of [`hilstar
-    #: optics`](optics.md) has point spread functions over field, wavelength and focus. Or it has
-    #: one image of the point spread function, the same all over the field and for all colours. Its
-    #: header has `OVERSAMP`, samples a tracker pixel (1 where it is missing), and `PIXINT`, whether
-    #: the pixel is integrated (F where it is missing).
+    #: `"gaussian"`, or a FITS file: that of [`hilstar optics`](optics.md#the-file), or one image
+    #: with `OVERSAMP` (samples a pixel, 1) and `PIXINT` (is the pixel integrated? F).
     psf: str = GAUSSIAN
     #: Where the detector stands along the axis, as the file of `psf` counts it.
     focus_um: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
@@ -144,17 +141,14 @@ class Tracker(Table, frozen=True):
     #: Where the boresight meets the detector, in tracker pixels. Default: the middle of the
     #: detector
     principal_point_px: Point | None = None
-    #: The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`,
-    #: `k2`, `k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those not
-    #: given are 0. Default: an ideal lens
+    #: The tracker's flight model: a TOML file with `k1`, `k2`, `k3`, `p1` and `p2` (Brown-Conrady),
+    #: from direction to pixel. Default: an ideal lens
     distortion: str | None = None
-    #: How the tracker sits in the spacecraft: turns body components into camera components. Applied
-    #: to each source whose attitude is the body's (see [attitude in](attitude-in.md)); packets,
-    #: JSON and CSV hold the camera's. Default: the body's axes, with a notice
+    #: Turns body components into camera components, for each source whose attitude is the body's
+    #: ([attitude in](attitude-in.md#a-bodys-attitude)). Default: the body's axes, with a notice
     q_body_to_cam: Rotation | None = None
-    #: `"auto"`: of the point spread functions of `[tracker.optics] psf` as few as keep flux and
-    #: centroid of a star within the next two, a Gaussian first; a notice says which. `"full"`: all
-    #: of the file.
+    #: `"auto"`: the simplest PSF that keeps a star's flux and centroid within the next two.
+    #: `"full"`: all of the file.
     effort: Literal["full", "auto"] = "full"
     tolerance_mag: Positive = 0.02  #: Flux error that a star may then have, for `effort = "auto"`.
     tolerance_px: Positive = 0.02  #: Centroid error that it may have, in tracker pixels.
@@ -198,22 +192,18 @@ def check_channels(tracker: Tracker) -> None:
 class PrimariesSettings(Table, frozen=True):
     """The light of the monitor's red, green and blue, and where it lies within a pixel."""
 
-    #: The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per
-    #: nm of each primary at full drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the
-    #: display's own samples: its primaries are those three of which all others are mixtures.
-    #: Default: not known
+    #: A CSV `wavelength_nm,r,g,b`: relative spectral power per nm of each primary at full drive; or
+    #: an ArgyllCMS `.ccss` of this display. Default: not known
     file: str | None = None
-    #: In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a
-    #: Gaussian of about that chromaticity, and all three together are D65: approximate, as every
-    #: run says. Default: by `file`
+    #: In place of `file`, with the next two: CIE 1931 x and y of each primary, as Gaussians that
+    #: add up to D65: approximate. Default: by `file`
     xy_r: Chromaticity | None = None
     xy_g: Chromaticity | None = None  #: For green. Default: by `file`
     xy_b: Chromaticity | None = None  #: For blue. Default: by `file`
     #: Full width at half maximum of each primary that is given by `xy_`.
     width_nm: Annotated[float, Meta(ge=1, le=200)] = 30.0
-    #: `"white"`: all three have their light in the pixel's middle. `"rgb-stripe"`, `"bgr-stripe"`:
-    #: side by side, a third of a pixel apart. `"vertical"`: red above green above blue. A pixel
-    #: with a fourth subpixel, or that shares subpixels, is refused.
+    #: Where a pixel has its primaries' light: `"white"`, the middle; `"rgb-stripe"`,
+    #: `"bgr-stripe"`, a third of a pixel apart; `"vertical"`.
     layout: str = "white"
     #: In place of `layout`: where the light of red, green and blue lies, in pixels from the middle,
     #: right and down on the screen. Default: by `layout`
@@ -324,9 +314,8 @@ class Collimator(Table, frozen=True):
     #: Gaussian sigma of the collimator's or relay's own blur, in monitor pixels, as the twin sees
     #: it.
     psf_sigma_px: NotNegative = 0.0
-    #: The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and the
-    #: real alignment. It takes the place of the other keys of this table but `psf_sigma_px`.
-    #: Default: an ideal lens
+    #: The file of `hilstar calibrate geometric` or `alignment`: lens and real alignment, in place
+    #: of the other keys but `psf_sigma_px`. Default: an ideal lens
     geometry: str | None = None
 
 
@@ -405,12 +394,10 @@ class Verify(Table, frozen=True):
     #: What the screen truly does: `"none"`, reverses columns (`"x"`), reverses rows (`"y"`), or
     #: swaps its axes (`"swap"`).
     true_mirror: Literal["none", "x", "y", "swap"] = "none"
-    #: What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as
-    #: wide; `"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the
-    #: least squares of a Gaussian; `"psf"`, that of the PSF of `[tracker.optics]`, which is `fit`
-    #: where codes are judged; `"box3"` or `"box5"`, the centre of mass of so many pixels a side.
-    #: `quantisation = "auto"` judges codes by it, too. Default: `"window"`; to judge codes, all of
-    #: them
+    #: What the tracker finds its stars by, also to judge codes: a Gaussian `"window"` as wide as
+    #: the star, `"wide"` half as wide again, the plain `"moment"`, a Gaussian `"fit"`, a fit of the
+    #: `"psf"`, or the centre of mass of 3 x 3 or 5 x 5 pixels. Default: `"window"`; to judge codes,
+    #: all of them
     centroider: Literal["window", "wide", "moment", "fit", "psf", "box3", "box5"] | None = None
     #: Limit for the flux error of 95 % of stars, with their common zero point taken out; also the
     #: limit of that zero point.
@@ -420,10 +407,8 @@ class Verify(Table, frozen=True):
     #: Limit for the share of lost stars among those that stand alone, are shown, and are not
     #: clipped.
     lost_share: NotNegative = 0.02
-    #: Limit for the sigma of a star as the tracker sees the display, to that of a star of the sky
-    #: through the same lens, the tracker's pixel in both. A centroider tuned to the sky's stars
-    #: meets others beyond it. README's bench has 1.68, those of configs 1.24 to 1.68. See [how wide
-    #: a star is](twin.md#how-wide-a-star-is).
+    #: Limit for the sigma of a star on the display to that of a star of the sky, the tracker's
+    #: pixel in both ([how wide a star is](twin.md#how-wide-a-star-is)).
     star_sigma_ratio: Annotated[float, Meta(ge=1, le=MAX_NUMBER)] = 2.0
     #: Limit for the screen's black level in a tracker pixel, seen minus assumed. Default: a tenth
     #: of the faintest star's light over its disc (4 pi sigma^2)

@@ -33,11 +33,8 @@ class Bodies(Table, frozen=True):
     #: The Earth with its air, seen from an orbit: `[spacecraft] orbit` is then a file or
     #: `"source"`. Its night side is dark.
     earth: bool = False
-    #: The path of a list of element sets: two lines each (TLE), with name lines or without, or OMM
-    #: in
-    #: JSON, XML or CSV. Satellites and debris along their own paths, by SGP4, in and out of the
-    #: Earth's
-    #: shadow. Default: none
+    #: A list of element sets (TLE or OMM in JSON, XML or CSV): satellites along their own paths, by
+    #: SGP4, in and out of the Earth's shadow. Default: none
     satellites: str | None = None
     #: The path of a CSV with the columns
     #: `norad,standard_mag,period_s,amplitude_mag,flash_s,flash_at_s,size_m`, of which only the
@@ -53,9 +50,8 @@ class Diffuse(Table, frozen=True):
     always has it.
     """
 
-    #: The path of a FITS image with a WCS, or of a HEALPix map of the whole sky (`pip install
-    #: 'hilstar[healpix]'`). `BUNIT`, of HEALPix `TUNIT1`, is any surface brightness that Astropy
-    #: knows, at V: such as `mag/arcsec2`, `MJy/sr` or `W/(m2 um sr)`. Default: none
+    #: A FITS image with a WCS, or a HEALPix map (`pip install 'hilstar[healpix]'`), in any surface
+    #: brightness at V (`BUNIT`, `TUNIT1`). Default: none
     map: str | None = None
     #: B-V of its light, by which it becomes electrons as a star's does; the Sun's is 0.65.
     bv_mag: Magnitude = 0.65
@@ -76,11 +72,8 @@ class SkySettings(Table, frozen=True):
     catalogue_epoch_jyear: EpochJyear | None = None
     #: Julian year to which proper motion is applied, from the epoch of the catalogue's places.
     epoch_jyear: Annotated[float, Meta(ge=-10_000, le=10_000)] = 2026.0
-    #: The UTC of t = 0 (`t_ns` = 0), such as `"2026-11-21T00:00:00Z"`. It takes the place of
-    #: `epoch_jyear`, and bodies are where they are at each frame's time. `"unix"`: `t_ns` is Unix
-    #: time, as `time.time_ns()` has it, leap seconds and all; stars are those of the day of the
-    #: run. `"source"`: the log's own dates (AEM, SPICE, ROS), in `replay`, `simulate --log` and
-    #: `attitude`. Default: none
+    #: The UTC of `t_ns` = 0, such as `"2026-11-21T00:00:00Z"`, in place of `epoch_jyear`. `"unix"`:
+    #: `t_ns` is Unix time. `"source"`: the log's own dates (AEM, SPICE, ROS). Default: none
     epoch_utc: str | None = None
     #: Faintest V magnitude used, inclusive; fainter stars do not exist for this bench.
     faintest_v_mag: Magnitude = 7.5
@@ -89,18 +82,13 @@ class SkySettings(Table, frozen=True):
     brightness: Literal["dgs", "ags"] = "dgs"
     # results/tradeoff.csv, spectrum: real spectra by V-I are 0.026 mag off (95 %), a black body
     # 0.2.
-    #: `"pickles"`: spectra of real stars (Pickles 1998), chosen by V-I, and by B-V for the hottest.
-    #: `"mk"`: by the MK type that Hipparcos gives and V-I, dust included; by colour where the type
-    #: is none of O to M. `"blackbody"`: a black body at the temperature that the next key derives
-    #: from B-V.
+    #: `"pickles"`: real spectra (Pickles 1998) by V-I, by B-V for the hottest. `"mk"`: by
+    #: Hipparcos's MK type and V-I, dust included. `"blackbody"`: by `temperature`.
     spectrum: Literal["blackbody", "pickles", "mk"] = "pickles"
-    #: Temperature from B-V. `"wang2021"` is the formula of the thesis, with its step of 350 K at
-    #: B-V = 0. Both are held within 1000 and 200000 K, which matters to nine carbon stars under
-    #: `wang2021`.
+    #: Temperature from B-V. `"wang2021"` is the thesis's, with its step of 350 K at B-V = 0.
     temperature: Literal["ballesteros2012", "wang2021"] = "ballesteros2012"
-    #: `"phase"`: stars of your table with `epoch_jd` (of largest light), `period_d` and
-    #: `amplitude_mag` (half of the range) have their light at `epoch_utc`, by a sinusoid about V,
-    #: all run long. Others have their mean, as all have by `"mean"`.
+    #: `"phase"`: stars of your table with `epoch_jd`, `period_d` and `amplitude_mag` have their
+    #: light at `epoch_utc`; others their mean.
     variables: Literal["mean", "phase"] = "mean"
     #: Flux of a star of V = 0. `"vega"`: 3.631e-9 erg/s/cm2/A at V (Bessell 1998).
     #: `"iau-bolometric"`: the zero point of the thesis, 25 % fainter.
@@ -120,12 +108,8 @@ class SpacecraftSettings(Table, frozen=True):
     light bending and aberration.
     """
 
-    #: `"geocentre"`, or the path of a file: one element set (two lines, or OMM in JSON, XML or
-    #: CSV),
-    #: propagated by SGP4, or a CCSDS OEM (KVN; ICRF, GCRF or EME2000 about the Earth); `"source"`:
-    #: where
-    #: the messages of `[attitude] source = "vizard"` (Basilisk) have the spacecraft. Default: none;
-    #: `"geocentre"` with `[sky.bodies]`
+    #: `"geocentre"`; a file: one element set (two lines, or OMM) or a CCSDS OEM (KVN, about the
+    #: Earth); or `"source"`: Basilisk's messages. Default: none; `"geocentre"` with `[sky.bodies]`
     orbit: str | None = None
 
 
@@ -142,9 +126,8 @@ class SiteSettings(Table, frozen=True):
     pressure_hpa: PressureHpa | None = None
     temperature_c: Annotated[float, Meta(ge=-90, le=60)] = 10.0  #: Temperature of the air, Celsius.
     humidity: Annotated[float, Meta(ge=0, le=1)] = 0.5  #: Relative humidity.
-    #: Extinction, mag an air mass: `"ctio"`, `"kpno"`, `"la-palma"`, `"lick"`, `"mauna-kea"` or
-    #: `"paranal"`; the path of a CSV (`wavelength_nm,value`); or a number for all wavelengths. Lick
-    #: is the lowest of them, 1290 m; the air of a town takes more.
+    #: Mag an air mass: `"ctio"`, `"kpno"`, `"la-palma"`, `"lick"`, `"mauna-kea"`, `"paranal"`; a
+    #: CSV (`wavelength_nm,value`); or a number.
     extinction: float | str = "lick"
     #: Surface brightness of the sky at the zenith, V: 21.7 where it is dark, 18 in a town. It
     #: replaces no `[background]`. Default: none
@@ -162,10 +145,8 @@ class Background(Table, frozen=True):
     #: Surface brightness of sunlight through the tracker's optics, times each pixel's solid angle;
     #: the thesis takes 22.1. Default: none
     zodiacal_v_mag_arcsec2: Magnitude | None = None
-    #: Zodiacal light by direction from the Sun, with its spectrum (Leinert 1998, tables 17 and 19).
-    #: It needs `[sky] epoch_utc`. A field near the Sun, where the table is blank, is refused; the
-    #: pictures of a run take the nearest tabled light there, and a warning says so. Calibration
-    #: patterns have no such light. Default: none
+    #: Zodiacal light by direction from the Sun, with its spectrum (Leinert 1998); needs `[sky]
+    #: epoch_utc` ([background](the-light.md#the-background)). Default: none
     zodiacal: Literal["leinert1998"] | None = None
     #: By how many electrons per exposure the background grows from one edge of the detector to the
     #: other.

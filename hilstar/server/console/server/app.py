@@ -1,5 +1,5 @@
 """The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in
-docs/console-server.md.
+docs/console.md.
 """
 
 import asyncio

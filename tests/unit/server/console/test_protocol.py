@@ -66,7 +66,7 @@ def test_the_page_hears_every_key_of_a_message():
 
 
 def test_the_documentation_names_every_field():
-    page = (ROOT / "docs" / "console-server.md").read_text()
+    page = (ROOT / "docs" / "console.md").read_text()
     rows = {row.split("|")[1]: row for row in page.splitlines() if row.startswith("| `")}
     for key, struct in (("hello", Hello), ("state", PageState), ("event", EventLine)):
         assert set(re.findall(r"`(\w+)`", rows[f" `{key}` "])) >= set(names_of(struct))

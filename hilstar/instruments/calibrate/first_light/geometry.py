@@ -63,6 +63,7 @@ MAX_SCALE = 2.0
 # between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
 MIN_LIGHT_STEP = 1.3
 WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
+DRAWN_PX = 1460  # along the longer side of an image in a chart: twice its width
 MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
 UPRIGHT = (1, 0, 0, 1)
 QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
@@ -387,10 +388,19 @@ def draw_spots(
     path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str
 ) -> None:
     """Draw an image of the tracker (h, w) with a ring about each spot found."""
+    height, width = image.shape
+    # Of 16 million pixels Matplotlib makes 1 GB of colours. A spot of one pixel stays bright.
+    step = max(math.ceil(max(height, width) / DRAWN_PX), 1)
+    whole = image[: height // step * step, : width // step * step]
+    drawn = whole.reshape(height // step, step, width // step, step).max(axis=(1, 3))
+    edges = (-0.5, whole.shape[1] - 0.5, whole.shape[0] - 0.5, -0.5)
     with chart(path, finding, height_inch=6.4) as (axes,):
-        low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
+        low, high = (float(value) for value in np.percentile(drawn, (5, 99.9)))
         axes.imshow(
-            np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0))
+            np.sqrt(np.clip(drawn - low, 0, None)),
+            cmap="gray",
+            vmax=np.sqrt(max(high - low, 1.0)),
+            extent=edges,
         )
         axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
         # readable over stars and on black

@@ -72,7 +72,7 @@ class RenderSettings(Table, frozen=True):
     #: was chosen. `"full"`: no such economy.
     effort: Literal["full", "auto"] = "full"
     #: Flux error that any star of the catalogue may have at any phase, at rest and, where frames
-    #: turn, at 1 deg/s, all parts together, for `effort = "auto"` and `quantisation = "auto"`. The
+    #: turn, up to 1 deg/s, all parts together, for `effort = "auto"` and `quantisation = "auto"`. The
     #: default is what 8 bits keep down to V =
     #: 7.5, six magnitudes under white.
     tolerance_mag: Positive = DEFAULT_TOLERANCE_MAG
@@ -84,7 +84,7 @@ class RenderSettings(Table, frozen=True):
     #: only. `"on"`: headless too. `"off"`: never.
     motion: Literal["auto", "on", "off"] = "auto"
     #: Stars that move less than this, from the light of the middle row to the end of the frame's
-    #: light, are drawn as points at one moment.
+    #: light, are drawn as points where they are at the middle of that row's light.
     motion_above_px: NotNegative = 0.01
     #: Which GPU draws headless frames: its index in EGL's list, or a part of its name. `hilstar
     #: doctor` lists them. A window is drawn by its display's GPU. Default: the first of EGL's list

@@ -192,16 +192,16 @@ def limits_table() -> str:
 
 
 def economy_table() -> str:
-    """Five scenes by bits, with full effort and with what two tolerances need: processor time of
-    a whole frame.
+    """Five scenes by bits, with full effort and with what two tolerances need: the time of a
+    whole frame.
     """
     rows = rows_of("economy.csv")
     body = []
     for full, auto, loose in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
-        full_ms = float(full["cpu_ms"])
+        full_ms = float(full["frame_ms"])
         needs = []
         for row in (auto, loose):
-            ms = float(row["cpu_ms"])
+            ms = float(row["frame_ms"])
             needs.append(f"`{row['quantisation']}`, {figure(ms)} ms, {full_ms / ms:.1f}")
         worst_px = max(float(value) for name, value in auto.items() if name.startswith("max_px_"))
         errors = f"{float(auto['flux_max_mag']):.3f} mag, {worst_px:.3f} px"

@@ -154,9 +154,7 @@ def effort_of_run(bench: Any, explain: bool, as_json: bool) -> dict[str, dict[st
     """The key "effort" of a run's JSON, where the bench leaves something to its tolerance or it
     is to be explained; else {}.
     """
-    asked = bench.effort.asked
-    chosen = asked.effort == "auto" or asked.quantisation == "auto"
-    return explained_effort(bench, as_json and (explain or chosen))
+    return explained_effort(bench, as_json and (explain or bench.effort.is_chosen))
 
 
 def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:

@@ -32,6 +32,7 @@ from hilstar.server.summary import RunTally
 from hilstar.server.watchdog import AttitudeWatch, FrameWatch, GpuWatch
 
 GIVEN_UP_PERIODS = 2.0
+SHAKEN = 1.1  # a turn at what is claimed, shaken, is no faster one
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +169,9 @@ class FrameLoop:
         self.tally = RunTally()
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
         self.notices = Notices() if notices is None else notices
+        # The turn that is told of; a bench that leaves nothing to its tolerance has no claim.
+        claimed_deg_s = bench.effort.claimed_turn_deg_s if bench.effort.is_chosen else 0.0
+        self._told_above_deg_s = SHAKEN * claimed_deg_s or math.inf
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
         self._gpu = GpuWatch(bench.renderer, self.notices, self.stop, self.pacer.clock)
@@ -253,10 +257,25 @@ class FrameLoop:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None
+        if rate is not None:
+            self._see_turn(math.degrees(math.hypot(*rate)))
         view = self._bench.view(
             attitude.q_icrs_to_cam, rate, t_ns, attitude.velocity_km_s, attitude.place_km
         )
         return self._bench.light(view, faults)
+
+    def _see_turn(self, turn_deg_s: float) -> None:
+        """Tell the first turn that is faster than those that the bench's errors are claimed of."""
+        if turn_deg_s <= self._told_above_deg_s:
+            return
+        self._told_above_deg_s = math.inf
+        claimed_deg_s = self._bench.effort.claimed_turn_deg_s
+        self.notices.tell(
+            "beyond-claim",
+            f"the camera turns by {turn_deg_s:.2g} deg/s: errors are kept within [render]'s"
+            f" tolerance up to {claimed_deg_s:g} deg/s; those of faster turns are larger (told"
+            " once)",
+        )
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         # Never two in a row, so that even a machine too slow for its display shows something.

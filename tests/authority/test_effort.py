@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA
@@ -53,6 +54,11 @@ BENCHES = [
     (14, 7.5, 0.02, 0.02, "srgb", "auto", 0.6, 13),
     (16, 7.5, 0.02, 0.02, "srgb", "full", 0.85, 13),
 ]
+
+SLOW_BITS = (12, 16)
+SLOW_SHARE = 0.99  # of the motion from which on stars are paths
+SLOW_FIELDS = 40  # 15 to 25 stars that stand alone in each
+EDGE_PX = 20
 
 # Stars of one to three codes, under Sirius as white, and stars that turn: bits, faintest V, V of
 # white, codes, sigma of a sprite, turn (deg/s)
@@ -250,6 +256,80 @@ def test_the_claim_holds_for_stars_of_few_codes_and_for_stars_that_turn(
         flux_mag, off_px = worst_errors(bench, "srgb", sigma, rng, path_px)
         place_px = max(off_px.values())
         assert flux_mag <= claimed.error_mag <= MOST * flux_mag
-        # The claim is of slow turns, too: a star that moves less than this is drawn as a point.
+        # The claim is of slow turns, too, whose stars are drawn as points: the next test draws them.
         slow_px = claimed.taken.motion.choice.error_px
         assert place_px <= claimed.error_px <= MOST * max(place_px, slow_px)
+
+
+def swept_places(bench, q_icrs_to_cam, rate_rad_s, stars):
+    """Where stars are at the middle row's first light, px (2, n), and how fast they move there, px
+    a second (2, n), through a pinhole.
+    """
+    icrs_to_cam = Rotation.from_quat(np.roll(q_icrs_to_cam, -1)).as_matrix()
+    x, y, z = icrs_to_cam @ bench.stars.directions(stars).T
+    moved = -np.cross(rate_rad_s, np.stack([x, y, z], axis=1)).T
+    focal_px, middle_px = bench.camera.focal_length_px, (np.array(SIZE_PX) - 1) / 2
+    slope = np.where(z > 0.5, np.stack([x, y]) / z, np.nan)
+    return middle_px[:, None] + focal_px * slope, focal_px * (moved[:2] - slope * moved[2]) / z
+
+
+def lone_stars(places_px):
+    """The numbers of stars on the image that no other is near."""
+    x, y = places_px
+    beside = np.flatnonzero(
+        (np.abs(x - SIZE_PX[0] / 2) < SIZE_PX[0]) & (np.abs(y - SIZE_PX[1] / 2) < SIZE_PX[1])
+    )
+    inside = beside[
+        (x[beside] > EDGE_PX)
+        & (x[beside] < SIZE_PX[0] - EDGE_PX)
+        & (y[beside] > EDGE_PX)
+        & (y[beside] < SIZE_PX[1] - EDGE_PX)
+    ]
+    apart_px = np.hypot(x[inside][:, None] - x[beside], y[inside][:, None] - y[beside])
+    apart_px[inside[:, None] == beside] = np.inf
+    return inside[apart_px.min(axis=1) > STEP_PX]
+
+
+@pytest.mark.parametrize("bits", SLOW_BITS)
+def test_the_claim_of_a_turn_too_slow_for_paths_is_what_its_frames_have(bits, tmp_path, rng):
+    """Whole frames of such a turn against stars that move while their rows light one after the
+    other. Drawn at the middle row's first light they were twice as far off.
+    """
+    path = tmp_path / "bench.toml"
+    changed = {"monitor": {"bits": bits}, "render": {"motion": "on", "quantisation": "round"}}
+    path.write_text(bench_text(FRAME, changed))
+    sigma, off_px = 0.85, 0.0
+    near = np.arange(-HALF_PX, HALF_PX + 1)
+    with load(path) as bench:
+        seen, scan, white = bench.renderer.target.seen, bench.scan, bench.flux_at_white_e_per_s
+        sigma_px = math.sqrt(sigma**2 + 1 / 6 + seen.blur_px**2)
+        slow_px = SLOW_SHARE * bench.config.render.motion_above_px
+        slow_rad_s = slow_px / (max(bench.camera.scales_px_rad()) * scan.longest_s)
+        rates = bench.stars.electrons_per_s
+        shown_stars = np.flatnonzero(rates * bench.psf.peak_share <= white)
+        for _ in range(SLOW_FIELDS):
+            q_icrs_to_cam = Rotation.random(random_state=rng).as_quat(scalar_first=True)
+            way = rng.uniform(0.0, 2 * np.pi)
+            rate_rad_s = slow_rad_s * np.array([math.cos(way), math.sin(way), 0.0])
+            every = np.arange(len(rates))
+            places_px, speeds_px_s = swept_places(bench, q_icrs_to_cam, rate_rad_s, every)
+            stars = np.intersect1d(lone_stars(places_px), shown_stars)
+            if not len(stars):
+                continue
+            bench.renderer.begin_anew()
+            drawn = bench.draw(q_icrs_to_cam, 0, rate_rad_s)
+            codes = bench.code_values(drawn.levels).astype(np.float64)
+            image = white * light_of_codes(codes, bits, "srgb")
+            columns, rows = np.rint(places_px[:, stars]).astype(int)
+            late_s = (places_px[1, stars] / SIZE_PX[1] - 0.5) * scan.scanout_s + scan.hold_s / 2
+            x, y = places_px[:, stars] - (columns, rows) + speeds_px_s[:, stars] * late_s
+            wanted = rates[stars, None, None] * swept_stamps(
+                x, y, speeds_px_s[:, stars] * scan.hold_s, sigma
+            )
+            shown = image[rows[:, None, None] + near[:, None], columns[:, None, None] + near]
+            phases = rng.uniform(-0.5, 0.5, (2, len(stars)))
+            there, boxes = centroids(wanted, phases, seen.pixel_px, seen.blur_px, sigma_px, None)
+            here, _ = centroids(shown, phases, seen.pixel_px, seen.blur_px, sigma_px, boxes)
+            for kind, place in here.items():
+                off_px = max(off_px, np.hypot(*(place - there[kind])).max())
+        assert off_px <= bench.effort.error_px <= MOST * off_px

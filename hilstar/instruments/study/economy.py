@@ -252,18 +252,15 @@ def economy_finding(comparisons: list[EffortComparison]) -> str:
     """What was found in one sentence: the median speed-up at the default tolerance by bits, its
     range, and the errors.
     """
-    found = []
-    for bits in sorted({one.auto.bits for one in comparisons}):
-        mine = [
-            one.speed_up
-            for one in comparisons
-            if (one.auto.bits, one.auto.tolerance) == (bits, DEFAULT.name)
-        ]
-        if mine:
-            found.append(f"{np.median(mine):.1f} at {bits}")
+    by_bits: dict[int, list[float]] = {}
+    for comparison in comparisons:
+        if comparison.auto.tolerance == DEFAULT.name:
+            by_bits.setdefault(comparison.auto.bits, []).append(comparison.speed_up)
+    depths = ", ".join(str(bits) for bits in sorted(by_bits))
+    medians = ", ".join(f"{np.median(by_bits[bits]):.1f}" for bits in sorted(by_bits))
     slowest, quickest = (extreme(one.speed_up for one in comparisons) for extreme in (min, max))
     return (
-        f"Auto effort is {', '.join(found)} bits times as fast as full effort ({slowest:.1f} to"
+        f"At {depths} bits auto effort is {medians} times as fast as full effort ({slowest:.1f} to"
         f" {quickest:.1f} over all scenes and both tolerances), {within_words(comparisons)}"
     )
 

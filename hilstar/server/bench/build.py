@@ -61,6 +61,7 @@ from hilstar.server.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.server.bench.effort import (
     BEST,
     CHEAP,
+    CLAIMED_TURN_DEG_S,
     IN_TIME_SHARE,
     SURELY_IN_TIME,
     Effort,
@@ -178,7 +179,7 @@ class Display(NamedTuple):
     camera: Camera
     context: Context | None
     drive: FloatArray | float
-    turning: float
+    turning: float | None
     path_px: float
     darkest: float
 
@@ -242,27 +243,27 @@ def white_of(
     )
 
 
-def turning_of(config: BenchConfig, on_screen: bool) -> float:
+def turning_of(config: BenchConfig, on_screen: bool) -> float | None:
     """How far stars without paths are from the mean of their light at most, in units of their
-    motion; 0 at rest.
+    motion; None at rest.
 
-    A frame has them where they are at the middle row's first light, and its motion counts to the
-    end of its light.
+    A frame has them where they are at the middle of the middle row's light. The first and the last
+    row light up half a scan-out earlier and later, and the motion counts to the last row's end.
     """
     motion, scan = config.render.motion, scan_of(config.monitor)
     moves = motion == "on" or (motion == "auto" and on_screen)
     if not moves or not scan.longest_s:
-        return 0.0
-    return (scan.scanout_s + scan.hold_s) / 2 / scan.longest_s
+        return None
+    return scan.scanout_s / 2 / scan.longest_s
 
 
 def path_of(config: BenchConfig, camera: Camera, on_screen: bool) -> float:
-    """How far a star moves on the monitor while its row is lit, turning at 1 deg/s, px; 0 at
-    rest.
+    """How far a star moves on the monitor while its row is lit, turning at CLAIMED_TURN_DEG_S,
+    px; 0 at rest.
     """
-    if not turning_of(config, on_screen):
+    if turning_of(config, on_screen) is None:
         return 0.0
-    turned_rad = math.hypot(*TIMED_RATE_RAD_S) * scan_of(config.monitor).hold_s
+    turned_rad = math.radians(CLAIMED_TURN_DEG_S) * scan_of(config.monitor).hold_s
     return turned_rad * max(camera.scales_px_rad())
 
 

@@ -47,6 +47,10 @@ CHEAP, BEST = BY_COST[0], BY_COST[-1]
 # the upper time is a whole refresh.
 SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
 NO_ERROR = (0.0, 0.0)
+# Errors are claimed of frames that turn up to this. On longer paths `round` shows fainter stars
+# worse, and centroiders that look for a point have no place of their own along a path.
+CLAIMED_TURN_DEG_S = 1.0
+CLAIMED = f"errors are of turns up to {CLAIMED_TURN_DEG_S:g} deg/s; those of faster ones are larger"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,8 @@ class Light:
     decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by the table,
     `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns,
     `turning` is how far a star of a frame without paths is from its place, in units of its motion;
-    0 for a scene at rest; `path_px` is how far one moves while its row is lit, at 1 deg/s.
+    None for a scene at rest; `path_px` is how far one moves while its row is lit, at
+    CLAIMED_TURN_DEG_S.
     """
 
     response: Response
@@ -93,7 +98,7 @@ class Light:
     exposure_frames: int = EXPOSURE_FRAMES
     cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
     measured: FieldCost | None = None
-    turning: float = 0.0
+    turning: float | None = None
     path_px: float = 0.0
 
     @property
@@ -215,6 +220,16 @@ class Effort:
     def sides(self) -> SpriteSides:
         """The sides of sprites by rate."""
         return self.taken.sprites.sides
+
+    @property
+    def is_chosen(self) -> bool:
+        """Whether the bench leaves a part to its tolerance."""
+        return self.asked.effort == "auto" or self.asked.quantisation == "auto"
+
+    @property
+    def claimed_turn_deg_s(self) -> float:
+        """The fastest turn that the errors are claimed of; 0 where no frame turns."""
+        return 0.0 if self.light.turning is None else CLAIMED_TURN_DEG_S
 
     @property
     def motion_above_px(self) -> float:
@@ -393,7 +408,7 @@ def code_part(effort: Effort) -> Choice:
         whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
         notes.append(f"as `{errors.centroider}` finds stars{whom}")
     if errors.turns:
-        notes.append("turning at 1 deg/s")
+        notes.append(f"turning at {CLAIMED_TURN_DEG_S:g} deg/s")
     if not math.isfinite(errors.flux_mag):
         notes.append("the faintest stars of the catalogue show nothing")
     if method == BEST or (render.quantisation == "auto" and len(_methods(render, light)) == 1):
@@ -497,7 +512,7 @@ def cut_px(size_px: int, psf: Psf) -> float:
 def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
     """From which motion on stars are paths: none at rest; else from the file's on, or from more."""
     floor_px = render.motion_above_px
-    if not light.turning:
+    if light.turning is None:
         return [Motion(floor_px, Choice("paths", "none: nothing moves within a frame", *NO_ERROR))]
     path_ms = PATH_MS * light.stars * _scale(render, light)
     above_px = [floor_px]
@@ -509,9 +524,10 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
         ]
     found = []
     for px in above_px:
-        # Only frames between the file's motion and this one are drawn sooner.
-        ms, saved_ms = (path_ms, 0.0) if px == floor_px else (0.0, path_ms)
-        note = "" if px == floor_px else "saves in frames that move less"
+        ms, saved_ms, note = path_ms, 0.0, CLAIMED
+        if px > floor_px:
+            # Only frames between the file's motion and this one are drawn sooner.
+            ms, saved_ms, note = 0.0, path_ms, f"{CLAIMED}; saves in frames that move less"
         choice = Choice(
             "paths",
             f"from {px:g} px within a frame on",

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import normalise
+from hilstar.basics.rotation import normalise, propagate
 from hilstar.basics.units import magnitude
 from hilstar.display.calibration import Calibration
 from hilstar.display.footprints import FootprintMap, star_losses_mag
@@ -244,12 +244,15 @@ class Bench:
     ) -> View:
         """The view of a frame (see `View`), as the monitor's rows light up.
 
-        A rate that moves no star by more than `[render] motion_above_px` is 0 in it.
+        A rate that moves no star by more than `[render] motion_above_px` is 0 in it, and the
+        attitude that at the middle of the middle row's light.
         """
         rate = None if rate_cam_rad_s is None else np.asarray(rate_cam_rad_s, dtype=np.float64)
         if rate is not None:
             motion_px = float(np.linalg.norm(rate)) * self.scan.longest_s * self._px_per_rad
-            rate = rate if motion_px > self.config.render.motion_above_px else STILL
+            if 0 < motion_px <= self.config.render.motion_above_px:
+                q_icrs_to_cam = propagate(q_icrs_to_cam, rate, self.scan.hold_s / 2)
+                rate = STILL
         return View(q_icrs_to_cam, rate, t_ns, velocity_km_s, place_km, self.scan)
 
     @cached_property
@@ -299,10 +302,10 @@ class Bench:
         table.
 
         `frame` counts the frames shown, for `temporal`: a number not above the last one's begins
-        anew. With a rate that moves stars by more than `[render] motion_above_px`, each star is
-        drawn along its path while its row is lit; the attitude is then that at the middle row's
-        first light. Bodies are where they are at `t_ns`, by default at the start; without a rate
-        satellites' paths have their middle there.
+        anew. With a rate the attitude is that at the middle row's first light; one that moves stars
+        by more than `[render] motion_above_px` draws each along its path while its row is lit.
+        Bodies are where they are at `t_ns`, by default at the start; without a rate satellites'
+        paths have their middle there.
         """
         light = (
             None

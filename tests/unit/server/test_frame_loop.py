@@ -4,6 +4,8 @@ slot is a frame or missed.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,8 +26,10 @@ OLD = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 10**9, True)
 
 class SlowBench:
     """A bench whose sprites take as many ns as `cost` says of a frame's number, and whose
-    drawing takes a millisecond.
+    drawing takes a millisecond. Its errors are claimed of turns up to 1 deg/s.
     """
+
+    effort = SimpleNamespace(is_chosen=True, claimed_turn_deg_s=1.0)
 
     def __init__(self, tmp_path, clock: FakeClock, cost, more: str = "") -> None:
         self.config = parse_config(tmp_path / "bench.toml", SMALL_BENCH + more)
@@ -113,6 +117,15 @@ def test_a_frame_whose_sprites_took_too_long_is_given_up_and_the_next_is_shown(t
     assert (tally.given_up_frames, tally.missed_frames, tally.frames) == (1, 4, 16)
     assert run.shown[3].missed_before == 4  # its own slot, and the three that passed
     assert run.loop.notices.counts()["frame-given-up"] == 1
+
+
+@pytest.mark.parametrize(("turn_deg_s", "told"), [(0.0, 0), (1.05, 0), (5.0, 1), (30.0, 1)])
+def test_a_turn_beyond_what_effort_claims_is_told_once(tmp_path, turn_deg_s, told):
+    turning = replace(STILL, rate_cam_rad_s=(0.0, math.radians(turn_deg_s), 0.0))
+    for motion, count in (("on", told), ("off", 0)):
+        more = f'[render]\nmotion = "{motion}"\n'
+        run = Run(tmp_path, Limit(slots=20), more=more, attitude=turning)
+        assert run.loop.notices.counts().get("beyond-claim", 0) == count
 
 
 def test_no_two_frames_in_a_row_are_given_up(tmp_path):

@@ -125,8 +125,9 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
         missed, vain = 0, 0
         for turn, wanted in zip(turns, in_view, strict=True):
             seen, looked_at = finder(sorted_stars, turn, camera)
-            missed += len(wanted - set(sorted_stars.hip[seen].tolist()))
-            vain += looked_at - len(wanted)
+            shown = set(sorted_stars.hip[seen].tolist())
+            missed += len(wanted - shown)
+            vain += looked_at - len(wanted & shown)
         work = partial(finder, sorted_stars, turns[0], camera)
         own = name == f"cells of {CELL_DEG:g} deg"
         trials.append(Trial(name, missed, vain / len(turns), work, own, finder is _scan))

@@ -61,8 +61,9 @@ class RenderSettings(Table, frozen=True):
     #: `"auto"`: the cheapest codes, sprites and paths whose worst errors together keep the
     #: tolerance; `--explain` has a table.
     effort: Literal["full", "auto"] = "full"
-    #: Flux error that any star of the catalogue may have, all parts together, for `"auto"`. The
-    #: default is what 8 bits keep down to six magnitudes under white.
+    #: Flux error that any star of the catalogue may have, all parts together, for `"auto"`: at
+    #: rest and, where frames turn, up to 1 deg/s. The default is what 8 bits keep down to six
+    #: magnitudes under white.
     tolerance_mag: Positive = DEFAULT_TOLERANCE_MAG
     #: Centroid error that a star may have, monitor pixels, likewise: by the worst of six
     #: centroiders, or by that of `[verify] centroider`.
@@ -72,7 +73,7 @@ class RenderSettings(Table, frozen=True):
     #: only. `"on"`: headless too. `"off"`: never.
     motion: Literal["auto", "on", "off"] = "auto"
     #: Stars that move less than this, from the light of the middle row to the end of the frame's
-    #: light, are drawn as points at one moment.
+    #: light, are drawn as points where they are at the middle of that row's light.
     motion_above_px: NotNegative = 0.01
     #: Which GPU draws headless frames: index in EGL's list, or part of its name (`hilstar doctor`).
     #: A window's is its display's. Default: the first of EGL's list

@@ -126,13 +126,13 @@ def test_a_scene_at_rest_asks_nothing_of_paths():
     [("auto", False, False), ("auto", True, True), ("on", False, True), ("off", True, False)],
 )
 def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small_bench_file):
-    """A frame without a path is where the middle row's first light has it: half of its light
-    later it is halfway on.
+    """A frame without a path is where the middle of the middle row's light has it; the last row
+    lights up half a scan-out later.
     """
     text = f'{SMALL_BENCH}[render]\nmotion = "{motion}"\nquantisation = "round"\n'
     config = bench_file_of(small_bench_file, text).config
     scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
-    wanted = (scan_s + hold_s) / (scan_s + 2 * hold_s) if turns else 0.0
+    wanted = scan_s / (scan_s + 2 * hold_s) if turns else None
     assert turning_of(config, on_screen) == pytest.approx(wanted)
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.units import flux_ratio, magnitude
 from hilstar.display.balance import Balance
-from hilstar.display.quantise import Panel, UnquantisedFrame, shown_light
-from hilstar.display.quantisers import QUANTISERS, Quantisation
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantisation, UnquantisedFrame, shown_light
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.optics.psf import GaussianPsf, Psf
 from hilstar.optics.sprites import FrameLight, pack_sprites
 

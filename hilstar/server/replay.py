@@ -29,7 +29,8 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import ENDS, WrongSky
-from hilstar.display.quantisers import QUANTISERS, Quantisation
+from hilstar.display.quantise import Quantisation
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.frame_files import write_codes_png

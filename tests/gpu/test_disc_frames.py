@@ -14,11 +14,11 @@ from skyfield.api import Star
 
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.quantise import dither_levels, mask_turn, round_levels
-from hilstar.display.render.backend import Target
 from hilstar.display.render.disc_tiles import disc_tiles
 from hilstar.display.render.extended import ExtendedLayer
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.instruments.verify.measure import Comparison

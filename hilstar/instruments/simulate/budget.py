@@ -15,9 +15,9 @@ from hilstar.basics.arrays import IntArray
 from hilstar.basics.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 from hilstar.display.balance import Balance
+from hilstar.display.panel import Panel
 from hilstar.display.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.display.primaries import PRIMARIES, ChannelMatrix, channel_matrix, reddest_nm
-from hilstar.display.quantise import Panel
 from hilstar.server.bench.build import bench_primaries, named_channels
 from hilstar.server.bench.frame import Bench, clipping_hip, named
 from hilstar.server.bench.star_size import StarSize, star_size

@@ -15,10 +15,11 @@ import numpy as np
 
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.process.closing import Closing
+from hilstar.display.panel import Panel
 from hilstar.display.primaries import channel_matrix
-from hilstar.display.quantise import LitLight, Panel
-from hilstar.display.render.backend import Target
+from hilstar.display.quantise import LitLight
 from hilstar.display.render.numpy_backend import headless_context, open_backend
+from hilstar.display.render.target import Target
 from hilstar.optics.camera import Camera
 from hilstar.optics.glass.glass_psf import NodeSpline
 from hilstar.optics.psf import Psf, square_points

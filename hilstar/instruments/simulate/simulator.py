@@ -19,8 +19,8 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.display.render.backend import Target
 from hilstar.display.render.numpy_backend import headless_context, open_backend
+from hilstar.display.render.target import Target
 from hilstar.instruments.simulate.shutter import rolled
 from hilstar.optics.camera import Camera, linear_shares
 from hilstar.optics.exposure_motion import MIDDLE_S, own_row_s

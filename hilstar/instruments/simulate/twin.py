@@ -21,7 +21,8 @@ from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import to_matrix
 from hilstar.display.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.quantise import LitLight, Panel, lit_light, primary_levels
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import LitLight, lit_light, primary_levels
 from hilstar.display.response import Response, table_response
 from hilstar.instruments.simulate.optics import (
     BenchGeometry,

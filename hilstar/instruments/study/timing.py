@@ -27,8 +27,8 @@ from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
 from hilstar.display.quantise import shown_light
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import Levels
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics

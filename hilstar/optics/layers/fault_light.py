@@ -34,7 +34,7 @@ from hilstar.optics.layers.fault_kinds import (
     PointLight,
     StarGone,
 )
-from hilstar.optics.layers.layers import StarLayer
+from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.stray_light import gradient_image, map_image, read_map
 from hilstar.optics.layers.view import Canvas
 from hilstar.optics.psf import Psf

@@ -15,6 +15,10 @@ from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
 from hilstar.sky.stars import Stars
 
+# A wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85
+# px by 0.2 %.
+POINT_PX = 0.2
+
 STILL = np.zeros(3)
 AT_ONCE = Scan()
 

@@ -22,11 +22,13 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.balance import Seen
 from hilstar.display.calibration import BUILT_IN, Calibration, load_calibration, primary_responses
+from hilstar.display.panel import Panel
 from hilstar.display.primaries import chromatic_primaries, read_primaries
-from hilstar.display.quantise import Panel
-from hilstar.display.quantisers import QUANTISERS, Quantisation
-from hilstar.display.render.backend import Target, level_cost
+from hilstar.display.quantise import Quantisation
+from hilstar.display.quantisers import QUANTISERS
+from hilstar.display.render.backend import level_cost
 from hilstar.display.render.numpy_backend import headless_context, open_backend
+from hilstar.display.render.target import Target
 from hilstar.optics.camera import Camera
 from hilstar.optics.frame_motion import Orientation, Scan
 from hilstar.optics.glass.glass_psf import NodeSpline

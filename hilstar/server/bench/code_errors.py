@@ -17,9 +17,9 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import flux_ratio
 from hilstar.display.balance import Balance, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.phases import MARGIN_PX, WHITE, fainter, phase_image, shown_by
-from hilstar.display.quantise import Panel
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import Quantisation
 from hilstar.display.response import Response
 from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA
 from hilstar.optics.paths import node_counts, nodes_of

@@ -14,10 +14,12 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.display.balance import AS_USUAL, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.phases import USUAL_PSF
-from hilstar.display.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantiser
-from hilstar.display.quantisers import BY_COST, QUANTISERS, Quantisation
-from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
+from hilstar.display.quantise import EXPOSURE_FRAMES, LevelCost, Quantisation, Quantiser
+from hilstar.display.quantisers import BY_COST, QUANTISERS
+from hilstar.display.render.backend import level_cost
+from hilstar.display.render.target import MAX_SIDES, SpriteSide, SpriteSides
 from hilstar.display.response import Response
 from hilstar.optics.psf import MAX_CUT, Psf
 from hilstar.server.bench.code_errors import CodeErrors, CodeStars, code_stars, worst_errors

@@ -9,7 +9,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.fault_light import FaultCamera, FaultView
 from hilstar.optics.layers.faults import FaultLayer
-from hilstar.optics.layers.layers import StarLayer
+from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.view import Canvas
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import star_rates

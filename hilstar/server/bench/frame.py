@@ -20,7 +20,8 @@ from hilstar.basics.rotation import normalise
 from hilstar.basics.units import magnitude
 from hilstar.display.calibration import Calibration
 from hilstar.display.footprints import FootprintMap, star_losses_mag
-from hilstar.display.quantise import Panel, Quantiser, shown_light
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantiser, shown_light
 from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import Backend, linear_light
 from hilstar.display.response import Codes, Levels, code_dtype

@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from hilstar.display.balance import Balance, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.phases import (
     MARGIN_PX,
     WHITE,
@@ -18,7 +19,6 @@ from hilstar.display.phases import (
     phase_image,
     shown_by,
 )
-from hilstar.display.quantise import Panel
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf

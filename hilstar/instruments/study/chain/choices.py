@@ -23,7 +23,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import normalise
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import Quantisation
 from hilstar.instruments.study.predictors import Movement
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import assembled, bench_stars

@@ -16,9 +16,9 @@ from scipy.integrate import quad_vec
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import LIGHT_M_S, flux_ratio, magnitude
 from hilstar.display.phases import WHITE, fainter, measure
-from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study.codes import (
     AIMS,

@@ -20,8 +20,8 @@ from hilstar.basics.rotation import angle_between_rad, normalise, to_matrix
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.phases import measure
-from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study.predictors import (
     JITTER,

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from hilstar.basics.rotation import to_matrix
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.quantise import Panel
+from hilstar.display.panel import Panel
 from hilstar.display.response import gamma_response, table_response
 from hilstar.instruments.simulate import optics as twin_optics
 from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics

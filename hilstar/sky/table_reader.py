@@ -23,16 +23,9 @@ import numpy.typing as npt
 from numpy.polynomial.polynomial import polyval
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.errors import InputError, cannot_read, shortened
+from hilstar.basics.errors import InputError, cannot_read, shortened, size_text
 from hilstar.basics.image_files import ImageSizeError, is_fits, unpacked
-from hilstar.basics.reading import (
-    HEAD_BYTES,
-    UTF_16_MARKS,
-    kind_of,
-    open_regular,
-    read_bytes,
-    size_text,
-)
+from hilstar.basics.reading import HEAD_BYTES, UTF_16_MARKS, kind_of, open_regular, read_bytes
 from hilstar.basics.text_tables import TextTable, open_table
 from hilstar.basics.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 from hilstar.sky.catalog import load_catalog

@@ -24,12 +24,12 @@ from hilstar.instruments.simulate.twin import Twin
 from hilstar.instruments.verify.measure import Comparison
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
-from hilstar.optics.frame_motion import Scan
 from hilstar.optics.layers.bodies import BodyLayer
 from hilstar.optics.layers.layers import light_of, sky_layers
 from hilstar.optics.layers.truth import brightest_in_view
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import load
 from hilstar.server.bench.frame import Bench

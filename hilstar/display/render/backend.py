@@ -18,8 +18,8 @@ from hilstar.display.quantise import LevelCost, Quantiser
 from hilstar.display.render.target import Target
 from hilstar.display.response import Levels
 from hilstar.optics.extended import LightMap
-from hilstar.optics.frame_motion import Orientation
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Orientation
 from hilstar.optics.sprites import FrameLight, by_channel, by_primary, without_stars
 from hilstar.sky.stars import Stars
 

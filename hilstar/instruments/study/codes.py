@@ -29,6 +29,7 @@ from hilstar.display.quantise import (
     mask_turn,
     shown_light,
 )
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.response import (
     Response,
     Weights,
@@ -141,8 +142,9 @@ def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list
     errors = []
     for mag in mags:
         wanted, share = fainter(sprites, mag), flux_ratio(mag)
+        kind = QUANTISERS[way.method]
         shown = shown_by(
-            way.method, way.frames, panel, (bright * share).astype(np.float32), wanted, balance
+            kind, way.frames, panel, (bright * share).astype(np.float32), wanted, balance
         )
         errors.append(judge.errors(shown, share))
     return errors

@@ -20,8 +20,9 @@ from hilstar.optics.extended import (
     Shear,
     disc_lights,
 )
-from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, slowed
+from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, slowed
 from hilstar.optics.layers.view import POINT_PX, Canvas, View
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight
 from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
 from hilstar.sky.stars import Stars

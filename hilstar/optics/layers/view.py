@@ -10,8 +10,9 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import Motion
-from hilstar.optics.frame_motion import CameraTurn, Scan
+from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight
 from hilstar.sky.stars import Stars
 

@@ -12,10 +12,10 @@ from hilstar.optics.layers.faults import FaultLayer
 from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.view import Canvas
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import star_rates
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import NO_SCENARIO, FaultSchedule, Scenario
+from hilstar.server.bench.star_rates import star_rates
 from hilstar.sky.stars import Stars, aberrate
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from hilstar.server.bench.site import Ground
 from hilstar.sky.bodies.kernel import Kernel
 from hilstar.sky.bodies.light import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
-from hilstar.sky.bodies.orbit import TLE_ADVICE, VERSION_KEY, Geocentre, OemOrbit, Orbit, TleOrbit
+from hilstar.sky.bodies.oem import VERSION_KEY, OemOrbit
+from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, Orbit, TleOrbit
 from hilstar.sky.bodies.shapes import EARTH
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.stars import total_and_colours

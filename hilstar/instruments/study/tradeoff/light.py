@@ -42,9 +42,10 @@ from hilstar.instruments.study.tradeoff.places import (
 from hilstar.instruments.study.trials import Figure, Trial, Trials
 from hilstar.optics.psf import MAX_CUT
 from hilstar.optics.sprites import FrameLight, make_sprites, pack_sprites
-from hilstar.server.bench.build import bench_calibration, brightest_peak_e_per_s
 from hilstar.server.bench.cameras import ideal_monitor
 from hilstar.server.bench.config import Monitor, RenderSettings, SkySettings
+from hilstar.server.bench.monitor import bench_calibration
+from hilstar.server.bench.scene import brightest_peak_e_per_s
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.spectrum import (

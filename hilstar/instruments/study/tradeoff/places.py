@@ -39,9 +39,9 @@ from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight, pack_sprites
-from hilstar.server.bench.build import bench_stars
 from hilstar.server.bench.cameras import ideal_monitor, tracker_psf
 from hilstar.server.bench.config import BenchConfig, RenderSettings, read_config
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
 

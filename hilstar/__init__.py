@@ -9,7 +9,8 @@ from hilstar.basics.version import __version__ as __version__
 if TYPE_CHECKING:
     from hilstar.basics.errors import HilstarError, InputError, MachineError
     from hilstar.server.bench.build import load
-    from hilstar.server.bench.frame import Bench, Drawn, Frame
+    from hilstar.server.bench.drawn import Drawn
+    from hilstar.server.bench.frame import Bench, Frame
     from hilstar.server.sender import Sender
 
 __all__ = [

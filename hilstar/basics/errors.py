@@ -101,3 +101,11 @@ def did_you_mean(word: object, known: Iterable[str]) -> str:
     by_small_letters = {one.casefold(): one for one in known}
     near = difflib.get_close_matches(shortened(word).casefold(), by_small_letters, n=1)
     return f"did you mean {by_small_letters[near[0]]}? " if near else ""
+
+
+def size_text(size_bytes: int) -> str:
+    """A size for a person: "1.5 GB"."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size_bytes >= factor:
+            return f"{size_bytes / factor:.4g} {unit}"
+    return f"{size_bytes} bytes"

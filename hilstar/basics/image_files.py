@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.reading import size_text
+from hilstar.basics.errors import size_text
 
 if TYPE_CHECKING:
     from astropy.io import fits

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 import msgspec
 
-from hilstar.basics.errors import InputError, cannot_read, shortened
+from hilstar.basics.errors import InputError, cannot_read, shortened, size_text
 
 # What msgspec raises for bytes that are no JSON of the wanted form: for some that are no UTF-8 it
 # is Python's own error.
@@ -105,14 +105,6 @@ def kind_of(head: bytes) -> str | None:
             if head.startswith(magic):
                 return kind
     return None
-
-
-def size_text(size_bytes: int) -> str:
-    """A size for a person: "1.5 GB"."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size_bytes >= factor:
-            return f"{size_bytes / factor:.4g} {unit}"
-    return f"{size_bytes} bytes"
 
 
 def exists(path: Path) -> bool:

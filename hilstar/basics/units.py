@@ -12,6 +12,11 @@ from typing import TYPE_CHECKING, overload
 
 if TYPE_CHECKING:
     from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray
+
+KM_PER_AU = 149_597_870.7
+
+COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 
 NS_PER_US = 1_000
 NS_PER_MS = 1_000_000

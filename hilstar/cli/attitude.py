@@ -138,7 +138,7 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
 
     from hilstar.basics.rotation import to_radec_roll_deg
     from hilstar.optics.layers.view import View
-    from hilstar.server.bench.build import brightest_seen
+    from hilstar.server.bench.star_light import brightest_seen
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
     stars = brightest_seen(file, View(sample.q_icrs_to_cam, t_ns=sample.t_ns), SHOWN_STARS)

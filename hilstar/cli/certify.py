@@ -12,7 +12,7 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory, write_whole
 from hilstar.basics.reading import exists
-from hilstar.cli.first_light import image_source, virtual_truth
+from hilstar.cli.image_source import image_source, virtual_truth
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
 from hilstar.server.console.terminal import print_found, say
 

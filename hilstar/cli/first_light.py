@@ -12,15 +12,13 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.basics.reading import exists
-from hilstar.basics.resources import resource_path
+from hilstar.cli.image_source import image_source, virtual_truth
 from hilstar.cli.options import (
     MAX_SEED,
     BenchFile,
     Json,
     check_files,
     frames_of,
-    parse_diode,
 )
 from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
 from hilstar.server.console.terminal import print_found, say
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
 
 PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
 MAX_FRAMES = 1000  # images that verify averages
-EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 
 
 def first_light(
@@ -235,47 +232,3 @@ def _handed_on(endpoint: str | None, source: "ImageSource") -> Iterator[None]:
         source.hand_on(PatternFrames(sender))
         say(f"frames: {sender.endpoint}")
         yield
-
-
-def virtual_truth(path: Path | None) -> Path | None:
-    """The file of --virtual; the example that comes with hilstar is found by its name."""
-    if path is not None and path.name == EXAMPLE_TRUTH and not exists(path):
-        return resource_path("configs", EXAMPLE_TRUTH)
-    return path
-
-
-def image_source(
-    file: "files.BenchFile",
-    grab: str | None,
-    virtual: Path | None,
-    dark: Path | None,
-    diode: str | None,
-    seed: int,
-) -> "ImageSource":
-    """The source of images. Raises InputError for options that exclude each other."""
-    from hilstar.instruments.calibrate.first_light.image_sources import (
-        ByHand,
-        GrabCamera,
-        GrabCommand,
-        SerialDiode,
-        VirtualBench,
-    )
-    from hilstar.instruments.calibrate.geometric.observed import read_image
-    from hilstar.server.bench.bench_file import read_bench_file
-    from hilstar.server.genicam.camera import PREFIX
-
-    if virtual is not None:
-        for name, given in (("grab", grab), ("dark", dark), ("diode", diode)):
-            if given is not None:
-                raise InputError(
-                    f"--{name} and --virtual: a virtual bench has its own; leave one of them out"
-                )
-        return VirtualBench(file, read_bench_file(virtual), seed)
-    if dark is not None:
-        read_image(dark, file.config.tracker.resolution_px)
-    recorder = None if diode is None else SerialDiode(*parse_diode(diode))
-    if grab is None:
-        return ByHand(dark, recorder)
-    if grab.startswith(PREFIX):
-        return GrabCamera(file, grab.removeprefix(PREFIX), dark, recorder)
-    return GrabCommand(grab, dark, recorder)

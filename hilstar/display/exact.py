@@ -14,15 +14,17 @@ run.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, IntArray
+from hilstar.basics.units import COMPUTE_VERSION
 from hilstar.display import quantise
 from hilstar.display.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, Weights
 from hilstar.display.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
+from hilstar.display.panel import Panel
 from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
@@ -35,7 +37,6 @@ OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
 CARRIED = 32  # sprites of a path that hand on their errors; the next ones begin anew, beside them
 NONE = np.float32(1e30)  # the square of a choice that does not exist yet
-COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 MAX_NEAR = 128  # pixels of a star that exact.comp has bits for: sprites up to a sigma of 1.8 px
 MAX_SIZE = 63  # largest footprint whose places fit into six bits
 # As MS_A_STAR. NumPy: 0.03 to 0.06 of 150 to 1800 stars, and more for sprites that are too wide for
@@ -108,7 +109,7 @@ class ExactQuantiser(quantise.Quantiser):
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
     def __init__(
-        self, panel: quantise.Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL
+        self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL
     ) -> None:
         super().__init__(panel, resolution_px, psf, seen)
         self._map = FootprintMap(resolution_px, psf)
@@ -170,7 +171,7 @@ class ExactQuantiser(quantise.Quantiser):
         return 0.0
 
     @classmethod
-    def faintest_e_per_s(cls, panel: quantise.Panel, psf: Psf) -> float:
+    def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
         """The rate of half a step: any pixel of the star may show it."""
         return panel.response.half_step * panel.flux_at_white_e_per_s
 
@@ -422,3 +423,13 @@ def _turn_one_more(
     can = np.flatnonzero(np.isfinite(more.min(axis=0)))
     up[pixel[can], stars[can]] ^= True
     error[:, stars[can]] += arm[:, pixel[can], can] * by[pixel[can], can]
+
+
+class Turn(NamedTuple):
+    """One of a target's panels: for how much of what stars left in each, in its steps, they make
+    up here; choices kept.
+    """
+
+    plane: int
+    makes_up: list[float]
+    kept: int = KEPT

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import magnitude
-from hilstar.display.quantise import Panel
+from hilstar.display.panel import Panel
 from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight

@@ -11,8 +11,8 @@ import numpy as np
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.units import flux_ratio, magnitude
 from hilstar.display.balance import Balance
-from hilstar.display.quantise import Panel, UnquantisedFrame, shown_light
-from hilstar.display.quantisers import QUANTISERS, Quantisation
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantiser, UnquantisedFrame, shown_light
 from hilstar.optics.psf import GaussianPsf, Psf
 from hilstar.optics.sprites import FrameLight, pack_sprites
 
@@ -107,19 +107,19 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
 
 
 def shown_by(
-    method: Quantisation,
+    kind: type[Quantiser],
     exposure_frames: int,
     panel: Panel,
     linear: Float32Array,
     sprites: FrameLight,
     balance: Balance,
 ) -> FloatArray:
-    """The light (h, w) that a method shows for a linear image, with `temporal` the mean of
-    `exposure_frames` frames.
+    """The light (h, w) that a kind of quantiser shows for a linear image, of several frames their
+    mean over `exposure_frames`.
 
     `balance` is that of `exact`, with the sprites' PSF.
     """
-    quantiser = QUANTISERS[method](panel, linear.shape[::-1], balance.psf, balance.seen)
+    quantiser = kind(panel, linear.shape[::-1], balance.psf, balance.seen)
     exposed = quantiser.exposure(FRAMES_BEFORE, exposure_frames)
     levels = (
         quantiser.draw(UnquantisedFrame(sprites, lambda: linear, lambda: linear, number))

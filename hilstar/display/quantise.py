@@ -16,17 +16,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
-from hilstar.basics.errors import InputError
 from hilstar.display.balance import AS_USUAL, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.response import Levels, Response, encode
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
+
+Quantisation = Literal["round", "dither", "temporal", "exact"]
 
 MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/make_blue_noise.py
 
@@ -38,44 +40,6 @@ MAX_FINER = 4
 # a whole frame of 2500 to 5000 stars, for each: 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe
 # cores
 MS_A_STAR = 0.002
-
-
-@dataclass(frozen=True, slots=True)
-class Panel:
-    """A monitor as light becomes levels on it: its response, the light of white, and the relative
-    light of each pixel.
-
-    `uniformity` float32 (height, width) is each pixel's light relative to what the response says
-    (None: 1 everywhere). `primaries` are the panels of red, green and blue alone where they are
-    driven apart; `response` is then that of grey. Raises InputError where the uniformity is not
-    positive and finite.
-    """
-
-    response: Response
-    flux_at_white_e_per_s: float
-    uniformity: Float32Array | None = None
-    primaries: "tuple[Panel, ...]" = ()
-
-    def __post_init__(self) -> None:
-        if self.uniformity is not None and not (
-            np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()
-        ):
-            raise InputError(
-                "the uniformity map has pixels that are not positive; give each pixel its light"
-                " relative to the mean"
-            )
-
-    def gain(self) -> Float32Array | None:
-        """The factor of the wanted light before it is quantised, float32 (height, width), or None
-        for 1.
-
-        A product and not a quotient: of the two only the product is rounded the same by every GL.
-        """
-        return None if self.uniformity is None else np.reciprocal(self.uniformity, dtype=np.float32)
-
-    def light_e_per_s(self) -> Float32Array:
-        """The light of each level in the unit of the linear image, float32 (levels,)."""
-        return np.asarray(self.response.light * self.flux_at_white_e_per_s, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)

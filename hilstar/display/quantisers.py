@@ -1,12 +1,8 @@
 """Every quantisation by the name that the bench file gives it."""
 
-from typing import Literal
-
 from hilstar.display.exact import ExactQuantiser
-from hilstar.display.quantise import DitherQuantiser, Quantiser, RoundQuantiser
+from hilstar.display.quantise import DitherQuantiser, Quantisation, Quantiser, RoundQuantiser
 from hilstar.display.temporal import TemporalQuantiser
-
-Quantisation = Literal["round", "dither", "temporal", "exact"]
 
 QUANTISERS: dict[Quantisation, type[Quantiser]] = {
     "round": RoundQuantiser,

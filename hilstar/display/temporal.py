@@ -17,7 +17,8 @@ from hilstar.basics.arrays import Float32Array, IntArray
 from hilstar.display.balance import OVER_FRAMES
 from hilstar.display.exact import Carried, ExactQuantiser, Left, nothing_carried
 from hilstar.display.footprints import PixelOrder
-from hilstar.display.quantise import Panel, mask_turn
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import mask_turn
 from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight

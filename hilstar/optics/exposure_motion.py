@@ -18,9 +18,9 @@ from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.optics.camera import Camera
-from hilstar.optics.frame_motion import Scan
 from hilstar.optics.paths import MAX_NODES, Chords, Paths, node_counts, nodes_of
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import Stars
 

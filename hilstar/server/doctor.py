@@ -33,9 +33,10 @@ from hilstar.display.window.this_monitor import identity_here
 from hilstar.display.window.window import displays, window_renderer
 from hilstar.display.window.x11 import server_of
 from hilstar.server.bench.bench_file import BenchFile, read_bench_or_heads
-from hilstar.server.bench.build import bench_calibration, bench_optics
 from hilstar.server.bench.cameras import FieldsOfView, bench_camera, fields_of_view
 from hilstar.server.bench.measured_on import MonitorCheck, check_monitor
+from hilstar.server.bench.monitor import bench_calibration
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.server.genicam.camera import INSTALL, has_aravis, list_cameras
 from hilstar.sky.catalog import load_catalog

@@ -16,7 +16,7 @@ from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, raise_priorit
 from hilstar.basics.running_statistics import RunningStatistics
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.bench.config import SyncSettings
-from hilstar.server.sync import SyncSummary
+from hilstar.server.pulse_summary import SyncSummary
 
 # A frame waits this long for the thread to take over, which would otherwise wait 0.5 ms or more for
 # Python's lock.

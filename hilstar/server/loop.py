@@ -25,7 +25,8 @@ from hilstar.optics.layers.faults import FaultLayer
 from hilstar.optics.layers.view import View
 from hilstar.optics.sprites import FrameLight
 from hilstar.server.bench.config import AttitudeSettings
-from hilstar.server.bench.frame import Bench, Drawn
+from hilstar.server.bench.drawn import Drawn
+from hilstar.server.bench.frame import Bench
 from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import AT_ONCE, FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.server.summary import RunTally

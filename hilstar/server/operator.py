@@ -15,7 +15,6 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_S
 from hilstar.display.render.aids import BLANK, CROSSHAIR, GRID, PATCH, AidLevels
 from hilstar.display.response import Levels
-from hilstar.server.bench.frame import Bench
 
 PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of white
 _BITS = {"blank": BLANK, "grid": GRID, "crosshair": CROSSHAIR}
@@ -213,11 +212,3 @@ class Operator:
             name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S}
             for name in self._frames
         }
-
-
-def aid_levels_of(bench: Bench) -> AidLevels:
-    """The aids' levels on a bench."""
-    x_px, y_px = bench.camera.boresight_px
-    return AidLevels(
-        bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px))
-    )

@@ -14,7 +14,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.optics.layers.fault_kinds import Now
-from hilstar.server.bench.frame import Drawn
+from hilstar.server.bench.drawn import Drawn
 from hilstar.server.operator import HEADLESS, Aids, OnScreen, Operator
 
 

@@ -29,7 +29,8 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import ENDS, WrongSky
-from hilstar.display.quantisers import QUANTISERS, Quantisation
+from hilstar.display.quantise import Quantisation
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.frame_files import write_codes_png
@@ -49,6 +50,7 @@ from hilstar.server.summary import RunSummary
 
 MAX_FRAMES = 100_000_000
 ROUNDING = 1e-6  # of a frame, by which a span of whole steps may fall short
+SAME_S = 1e-9  # two times of a run that are as near as this are one
 # `exact` in NumPy is another program than its shader: of two choices that are as good it may take
 # the other.
 OTHER_CODES_BY_NUMPY = 0.35
@@ -184,12 +186,9 @@ def plan_play(
     """
     check_stated(log, stated)
     if is_mcap(log) and not holds_ros(log):
-        frames = drawable_frames(log, math.radians(config.attitude.max_rate_deg_s))
-        first = last = next(frames, None)
-        for last in frames:  # noqa: B007 - all of them are looked at, and only the last is kept
-            pass
-        if first is not None and last is not None:
-            return _plan_run(log, wanted, first, last)
+        past = _look_through(log, wanted, math.radians(config.attitude.max_rate_deg_s))
+        if past is not None:
+            return _plan_run(log, wanted, past)
     read = open_log(log, stated)
     samples = read.samples
     for number, sample in enumerate(samples, start=1):  # what a stream would refuse
@@ -236,7 +235,37 @@ def _frame_step_s(log: Path, wanted: Wanted, refresh_hz: float, length_s: float)
     return step_s
 
 
-def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:
+@dataclass(frozen=True, slots=True)
+class PastFrames:
+    """The first and the last frame of a ledger, and how many are in the span that is wanted."""
+
+    first: FrameRecord
+    last: FrameRecord
+    count: int
+
+
+def _look_through(log: Path, wanted: Wanted, max_rate_rad_s: float) -> PastFrames | None:
+    """The frames of a ledger, each decoded and checked; None without any. Raises InputError for
+    one that cannot be drawn again.
+    """
+    first = last = None
+    count = 0
+    for last in drawable_frames(log, max_rate_rad_s):
+        if first is None:
+            first = last
+        count += _is_wanted(wanted, (last.swap_ns - first.swap_ns) / NS_PER_S)
+    return None if first is None or last is None else PastFrames(first, last, count)
+
+
+def _is_wanted(wanted: Wanted, at_s: float) -> bool:
+    """Whether a frame so long after the first is in the span that is wanted."""
+    after = wanted.start_s is None or wanted.start_s <= at_s
+    before = wanted.stop_s is None or at_s <= wanted.stop_s + SAME_S
+    return after and before
+
+
+def _plan_run(log: Path, wanted: Wanted, past: PastFrames) -> Play:
+    first, last, count = past.first, past.last, past.count
     if wanted.step_s is not None or wanted.speed not in {1.0, math.inf}:
         raise InputError(
             f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no"
@@ -244,22 +273,20 @@ def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) 
         )
     start_s, stop_s = _span(log, wanted, (last.swap_ns - first.swap_ns) / NS_PER_S)
 
-    def kept() -> Iterator[FrameRecord]:
-        frames = frame_records(log, tell=False)
+    def in_span() -> Iterator[FrameRecord]:
         return (
-            one
-            for one in frames
-            if start_s <= (one.swap_ns - first.swap_ns) / NS_PER_S <= stop_s + 1e-9
+            record
+            for record in frame_records(log, tell=False)
+            if _is_wanted(wanted, (record.swap_ns - first.swap_ns) / NS_PER_S)
         )
 
-    count = sum(1 for _ in kept())
     if not count:
         raise InputError(
             f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer"
             " span"
         )
     play = played_again(
-        kept,
+        in_span,
         count,
         sum(1 for _ in read_attitudes(log)),
         not math.isinf(wanted.speed),
@@ -311,7 +338,7 @@ def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices)
 def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
     start_s = 0.0 if wanted.start_s is None else wanted.start_s
     stop_s = length_s if wanted.stop_s is None else wanted.stop_s
-    if not 0 <= start_s <= stop_s <= length_s + 1e-9:
+    if not 0 <= start_s <= stop_s <= length_s + SAME_S:
         raise InputError(
             f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length,"
             f" {length_s:g}"

@@ -32,13 +32,13 @@ from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.running_statistics import RunningStatistics
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.answers.answer import Answer
-from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.faults import AnyFaults
 from hilstar.server.frame_pulse import FramePulse
 from hilstar.server.live_answers import LiveAnswers
 from hilstar.server.loop import FrameLoop, Limit, policy_of
 from hilstar.server.open_link import AnyLink
-from hilstar.server.operator import Aids, Operator, SwitchRequests, aid_levels_of
+from hilstar.server.operator import Aids, Operator, SwitchRequests
 from hilstar.server.pacer import FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.server.record.ledger import Ledger, LedgerSwitch
 from hilstar.server.record.ledger_records import below_step, frame_record

@@ -14,7 +14,8 @@ from hilstar.basics.units import NS_PER_MS
 from hilstar.basics.wrong_sky import WrongSkyTotal
 from hilstar.display.render.backend import Backend
 from hilstar.server.answers.judge import TrackerFigures
-from hilstar.server.sync import BeatSummary, SyncSummary
+from hilstar.server.pulse_summary import SyncSummary
+from hilstar.server.sync import BeatSummary
 
 MAX_LATE_SHARE = 0.01  # of frames that may be missed or stale where --strict passes
 

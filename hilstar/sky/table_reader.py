@@ -23,14 +23,13 @@ import numpy.typing as npt
 from numpy.polynomial.polynomial import polyval
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.errors import InputError, cannot_read, shortened
+from hilstar.basics.errors import InputError, cannot_read, shortened, size_text
 from hilstar.basics.image_files import ImageSizeError, is_fits, unpacked
 from hilstar.basics.reading import (
     HEAD_BYTES,
     kind_of,
     open_regular,
     read_bytes,
-    size_text,
     wide_encoding,
 )
 from hilstar.basics.text_tables import NO_NUMBERS, TextTable, open_table

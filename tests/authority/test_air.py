@@ -22,8 +22,9 @@ from hilstar.attitude.logs.earth import q_icrs_to_enu
 from hilstar.basics.rotation import from_radec_roll_deg, rotate
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import bench_file_of
-from hilstar.server.bench.build import bench_channels, bench_sources, bench_stars, site_air
 from hilstar.server.bench.site import site_glow_e_per_s_sr
+from hilstar.server.bench.star_light import bench_sources, bench_stars, site_air
+from hilstar.server.bench.star_rates import bench_channels
 from hilstar.sky.air import air_mass, extinction_curve, scintillation
 from hilstar.sky.electrons import Photometry, library_electrons_per_s, load_library
 from hilstar.sky.spectrum import TEMPERATURE_SCALES, Curve

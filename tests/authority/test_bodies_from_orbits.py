@@ -11,9 +11,11 @@ from sgp4.exporter import export_tle
 from skyfield.api import EarthSatellite
 from skyfield.magnitudelib import planetary_magnitude
 
-from hilstar.sky.bodies.light import KM_PER_AU, SUN_V_MAG, moon_v_mag, phase_angle_deg
+from hilstar.basics.units import KM_PER_AU
+from hilstar.sky.bodies.light import SUN_V_MAG, moon_v_mag, phase_angle_deg
 from hilstar.sky.bodies.moving import PLANETS
-from hilstar.sky.bodies.orbit import OemOrbit, Orbit, TleOrbit
+from hilstar.sky.bodies.oem import OemOrbit
+from hilstar.sky.bodies.orbit import Orbit, TleOrbit
 from tests.support.skies import ALL_BODIES, SKYFIELD_NAMES, moving_sky, random_utcs_ns, skyfield
 from tests.support.stars import stars_at
 

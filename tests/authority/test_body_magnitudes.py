@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from skyfield import magnitudelib
 
+from hilstar.basics.units import KM_PER_AU
 from hilstar.sky.bodies import light
 from hilstar.sky.bodies.light import (
-    KM_PER_AU,
     bodies_bv_mag,
     bodies_electrons_per_s,
     body_v_mag,

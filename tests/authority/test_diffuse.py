@@ -21,7 +21,8 @@ from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.extended import LightMap
 from hilstar.optics.layers.diffuse import DiffuseLayer
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import open_bench, star_rates
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.star_rates import star_rates
 from hilstar.sky.diffuse import read_diffuse_map
 from tests.support.benches import SMALL_BENCH
 

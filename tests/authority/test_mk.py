@@ -8,7 +8,7 @@ import pytest
 from hilstar.basics.units import magnitude
 from hilstar.instruments.study.settings import held_out_by_type, held_out_errors
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_stars
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import (
     VEGA_V0_W_M2_M,

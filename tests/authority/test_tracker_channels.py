@@ -12,7 +12,8 @@ from hilstar.display.primaries import reddest_nm
 from hilstar.instruments.simulate.budget import red_shares
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_channels, bench_stars
+from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.bench.star_rates import bench_channels
 from hilstar.sky.spectrum import DATA_DIR, Curve
 from tests.authority.integrals import read
 from tests.support.benches import ORION_Q, bench_text

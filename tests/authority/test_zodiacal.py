@@ -18,8 +18,8 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_optics
 from hilstar.server.bench.cameras import tracker_camera
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.sky.electrons import (
     VEGA_V0_W_M2_M,
     Optics,

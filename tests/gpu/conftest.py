@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.display.render.backend import WAY_VARIABLE
 from hilstar.display.render.context import gpus
 from hilstar.display.render.light_units import LightUnits
+from hilstar.display.render.way import WAY_VARIABLE
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from hilstar.display.render import cpu_stars
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf

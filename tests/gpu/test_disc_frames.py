@@ -14,22 +14,22 @@ from skyfield.api import Star
 
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.quantise import dither_levels, mask_turn, round_levels
-from hilstar.display.render.backend import Target
 from hilstar.display.render.disc_tiles import disc_tiles
 from hilstar.display.render.extended import ExtendedLayer
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.instruments.verify.measure import Comparison
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
-from hilstar.optics.frame_motion import Scan
 from hilstar.optics.layers.bodies import BodyLayer
 from hilstar.optics.layers.layers import light_of, sky_layers
 from hilstar.optics.layers.truth import brightest_in_view
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import load
 from hilstar.server.bench.frame import Bench

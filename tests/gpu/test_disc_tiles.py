@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 
 import hilstar.display.render.extended as layer
+from hilstar.basics.units import KM_PER_AU
 from hilstar.display.quantise import dither_levels, round_levels
-from hilstar.display.render.backend import Target
 from hilstar.display.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import DiscLight, Shear
 from hilstar.optics.psf import GaussianPsf
-from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc
-from hilstar.sky.bodies.light import KM_PER_AU
+from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.earth_disc import earth_disc
+from hilstar.sky.bodies.shapes import EQUATOR_KM
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA = (300, 260), (0.85, 0.85)

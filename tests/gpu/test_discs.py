@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import DiscView, LightMap, Pose, disc_lights
 from hilstar.optics.psf import GaussianPsf

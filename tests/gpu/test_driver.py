@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.display.render.backend import Target
 from hilstar.display.render.context import create_context
 from hilstar.display.render.driver import Driver
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import gamma_response
 from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at

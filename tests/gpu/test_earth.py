@@ -9,13 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.display.render.backend import Target
+from hilstar.basics.units import KM_PER_AU
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.optics.camera import Camera
 from hilstar.optics.extended import DiscView, Pose, disc_lights
 from hilstar.optics.psf import GaussianPsf
-from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, Disc, earth_disc
-from hilstar.sky.bodies.light import KM_PER_AU
+from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.earth_disc import AIR, earth_disc
+from hilstar.sky.bodies.shapes import EQUATOR_KM
 from tests.support.ray_traced.bodies import Body, lambert, limb
 from tests.support.ray_traced.image import edge_px, spread_image
 from tests.support.stars import sprites_at

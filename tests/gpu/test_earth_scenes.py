@@ -12,7 +12,8 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.server.bench.build import load
 from hilstar.server.bench.frame import Bench
-from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, POLAR_KM
+from hilstar.sky.bodies.earth_disc import AIR
+from hilstar.sky.bodies.shapes import EQUATOR_KM, POLAR_KM
 from tests.support.benches import bench_text
 from tests.support.ray_traced.bodies import Body, lambert, traced
 

@@ -11,8 +11,8 @@ import pytest
 
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.quantise import shown_light
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites

@@ -11,8 +11,8 @@ import pytest
 
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.quantise import dither_levels, mask_turn, round_levels, shown_light
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import GlowLight, LightMap

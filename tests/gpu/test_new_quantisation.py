@@ -10,11 +10,12 @@ import pytest
 from hilstar.basics.arrays import Float32Array
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.footprints import PixelOrder
-from hilstar.display.quantise import Panel, PixelQuantiser, level_dtype
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import PixelQuantiser, level_dtype
 from hilstar.display.quantisers import QUANTISERS
-from hilstar.display.render.backend import Target
 from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import Levels, srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.config import RenderSettings

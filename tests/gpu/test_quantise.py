@@ -11,10 +11,11 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.display.exact import ExactQuantiser
-from hilstar.display.quantise import Panel, dither_levels, round_levels, shown_light, turned_mask
-from hilstar.display.render.backend import Target
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import dither_levels, round_levels, shown_light, turned_mask
 from hilstar.display.render.encoder import CUT_WINGS
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import bit_stealing_response, gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at

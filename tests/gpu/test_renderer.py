@@ -10,9 +10,9 @@ import pytest
 
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.display.render import context as context_module
-from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import encode, srgb_response
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
 from hilstar.optics.sprites import FrameLight

@@ -7,10 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.display.render.backend import Target
 from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import SampledPsf
 from tests.support.psfs import airy, coma, sampled

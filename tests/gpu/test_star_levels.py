@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from hilstar.display.quantise import round_levels
-from hilstar.display.render.backend import SpriteSide, Target
 from hilstar.display.render.light_units import MAX_UNIT, WINGS
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf, pixel_shares

@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.display.quantise import Panel, shown_light
-from hilstar.display.render.backend import Target
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import gamma_response, srgb_response, table_response
 from hilstar.display.temporal import TemporalQuantiser
 from hilstar.optics.extended import LightMap

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from hilstar.basics.notices import Notices
-from hilstar.display.quantise import Panel
-from hilstar.display.quantisers import QUANTISERS, Quantisation
-from hilstar.display.render.backend import WAY_VARIABLE, SpriteSide, Target
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantisation
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import SpriteSide, Target
+from hilstar.display.render.way import WAY_VARIABLE
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf

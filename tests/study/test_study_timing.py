@@ -21,7 +21,7 @@ from hilstar.instruments.study.timing import (
     measure,
     slew,
 )
-from hilstar.optics.frame_motion import Scan
+from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.pictures import assert_drawn, table
 

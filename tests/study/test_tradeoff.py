@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field

@@ -11,7 +11,7 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import from_matrix
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.frame import Bench
 
 HEADER = "qw,qx,qy,qz,tw,tx,ty,tz"

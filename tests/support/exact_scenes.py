@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.display.quantise import Panel, round_levels, shown_light
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import round_levels, shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import Response, gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf

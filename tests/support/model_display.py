@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 from hilstar.display.window.x11 import BackBuffer, SwapStamps
 from hilstar.optics.layers.view import View
-from hilstar.server.bench.build import scan_of
 from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.monitor import scan_of
 from hilstar.server.screen.screen import Screen
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.calibrate.first_light.image_sources import on_screen
-from hilstar.optics.frame_motion import Orientation
+from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.any_bench import judge, run
 from tests.support.any_bench.draw import (

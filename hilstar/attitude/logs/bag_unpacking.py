@@ -13,8 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace, TracebackType
 from typing import IO, TYPE_CHECKING, Any
 
-from hilstar.basics.errors import InputError
-from hilstar.basics.reading import size_text
+from hilstar.basics.errors import InputError, size_text
 
 if TYPE_CHECKING:
     from rosbags.rosbag2.storage_mcap import ChunkInfo

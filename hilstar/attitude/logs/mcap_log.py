@@ -43,9 +43,9 @@ from zstandard import ZstdCompressor
 from zstandard import ZstdDecompressor as Zstd
 
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
-from hilstar.basics.errors import InputError
+from hilstar.basics.errors import InputError, size_text
 from hilstar.basics.files import MCAP_MAGIC
-from hilstar.basics.reading import NOT_JSON, open_regular, size_text
+from hilstar.basics.reading import NOT_JSON, open_regular
 
 Topics = Mapping[int, str]  # by channel
 Messages = list[tuple[int, bytes]]  # channel and content

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hilstar.attitude.logs.bag_unpacking import UnpackingError, bound_unpacking, refuse_overlaps
 from hilstar.attitude.logs.log_formats import LogHead
-from hilstar.basics.errors import InputError, shortened
+from hilstar.basics.errors import InputError, shortened, size_text
 from hilstar.basics.files import MCAP_MAGIC, temporary_folder
-from hilstar.basics.reading import HEAD_BYTES, open_regular, size_text
+from hilstar.basics.reading import HEAD_BYTES, open_regular
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

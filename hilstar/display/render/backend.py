@@ -5,163 +5,32 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 OpenGL.
 """
 
-import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, FloatArray
-from hilstar.basics.errors import InputError
-from hilstar.display.balance import AS_USUAL, Seen
-from hilstar.display.exact import COMPUTE_VERSION, KEPT, KEPT_BEFORE, ExactQuantiser
-from hilstar.display.quantise import LevelCost, Panel, Quantiser
-from hilstar.display.quantisers import QUANTISERS, Quantisation
-from hilstar.display.response import Levels, Response
+from hilstar.basics.arrays import Float32Array
+from hilstar.basics.units import COMPUTE_VERSION
+from hilstar.display.quantise import LevelCost, Quantiser
+from hilstar.display.render.target import Target
+from hilstar.display.response import Levels
 from hilstar.optics.extended import LightMap
-from hilstar.optics.frame_motion import Orientation
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Orientation
 from hilstar.optics.sprites import FrameLight, by_channel, by_primary, without_stars
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
     from moderngl import Context
 
-EGL_LIBRARY = "libEGL.so.1"
 NO_FRAME = -1  # before the first frame of a sequence
-MAX_SIDES = 8  # as in star.vert
 # what draws levels: "CPU" is `cpu_stars`, and "NumPy" the quantisers' own code, star by star
 Path = Literal[
     "CPU", "CPU, then compute shaders", "points", "points, then compute shaders", "NumPy"
 ]
-WAY_VARIABLE = "HILSTAR_DRAW"
-Way = Literal["gl", "cpu"]
-WAYS: tuple[Way, ...] = ("gl", "cpu")
-
-
-@dataclass(frozen=True, slots=True)
-class SpriteSide:
-    """The side of the sprites of stars below a rate."""
-
-    below_e_per_s: float
-    side_px: int
-
-
-SpriteSides = tuple[SpriteSide, ...]
-
-
-class Turn(NamedTuple):
-    """One of a target's panels: for how much of what stars left in each, in its steps, they make
-    up here; choices kept.
-    """
-
-    plane: int
-    makes_up: list[float]
-    kept: int = KEPT
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """The image that a backend draws: its pixels, its sprites, and a monitor's response where codes
-    are wanted.
-
-    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1
-    everywhere). `sides` are those of fainter stars' sprites, by falling rates, of the same parity
-    as the footprint. `seen` is how the tracker sees the monitor, for `exact` and `temporal`. Where
-    the `primaries` are driven apart, each has its panel, and its light lies at its place of
-    `places_px` (3, 2) within a pixel; `together` (3, 3) are products of two primaries' electrons
-    over the channels.
-    """
-
-    resolution_px: tuple[int, int]
-    psf: Psf
-    response: Response | None = None
-    flux_at_white_e_per_s: float = 1.0
-    quantisation: Quantisation = "round"
-    uniformity: Float32Array | None = None
-    sides: SpriteSides = ()
-    seen: Seen = AS_USUAL
-    primaries: tuple[Panel, ...] = ()
-    places_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
-    together: FloatArray = field(default_factory=lambda: np.eye(1))
-
-    def in_turn(self) -> list[Turn]:
-        """The order in which `exact` chooses the primaries' levels: by falling electrons a step,
-        for the last leave least.
-
-        Each makes up for those before it, by the light of the channels; in `temporal` for its own
-        light alone.
-        """
-        panels = self.primaries
-        if not panels:
-            return [Turn(0, [0.0])]
-        step = np.array([panel.response.light[1] * panel.flux_at_white_e_per_s for panel in panels])
-        order, alone = (
-            np.argsort(-step, kind="stable").tolist(),
-            getattr(QUANTISERS[self.quantisation], "remembers", False),
-        )
-        share = self.together / self.together.diagonal() * step[:, None] / step
-        # What a primary leaves has in it what it began with: `own` (3, 3) are its own errors by
-        # what each leaves.
-        own, found = np.zeros_like(share), []
-        for k in order:
-            makes_up = np.zeros(len(panels)) if alone else share[:, k] @ own
-            own[k] = -makes_up
-            own[k, k] += 1
-            found.append(
-                Turn(k, makes_up.tolist(), KEPT if alone or k == order[-1] else KEPT_BEFORE)
-            )
-        return found
-
-    def quantisers(self) -> dict[int, Quantiser]:
-        """NumPy's quantiser of each panel, in the order in which they choose; none without a
-        response.
-        """
-        panel, made = self.panel(), QUANTISERS[self.quantisation]
-        panels = self.primaries or (() if panel is None else (panel,))
-        found = {
-            k: made(panels[k], self.resolution_px, self.psf, self.seen)
-            for k, *_ in self.in_turn()
-            if panels
-        }
-        for k, makes_up, kept in self.in_turn() if self.primaries else ():
-            if isinstance(one := found[k], ExactQuantiser):
-                one.kept, one.given = kept, [(part, found[j]) for j, part in enumerate(makes_up)]
-        return found
-
-    def by_plane(
-        self, sprites: FrameLight | None, levels: Callable[[int, FrameLight | None], Levels]
-    ) -> Levels:
-        """The levels of a frame by those of each primary, if primaries are driven apart, chosen
-        in their order.
-        """
-        if not self.primaries or sprites is None:
-            found = {k: levels(k, sprites) for k, *_ in self.in_turn()}
-        else:
-            found = {
-                k: levels(k, by_primary(sprites, self.places_px, k)) for k, *_ in self.in_turn()
-            }
-        return (
-            found[0]
-            if not self.primaries
-            else Levels(np.stack([found[k] for k in range(len(found))], -1))
-        )
-
-    def panel(self) -> Panel | None:
-        """The monitor, None without a response. Raises InputError for a map that does not fit."""
-        if self.response is None:
-            return None
-        width, height = self.resolution_px
-        if self.uniformity is not None and self.uniformity.shape != (height, width):
-            found = " x ".join(map(str, self.uniformity.shape[::-1]))
-            raise InputError(
-                f"the uniformity map is {found} px and the monitor {width} x {height}; give one"
-                " value per pixel"
-            )
-        return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,19 +48,6 @@ class ScreenView:
     orientation: Orientation = field(default_factory=Orientation)
     cross_px: tuple[float, float] = (0.0, 0.0)
     triples: npt.NDArray[np.uint16] | None = None
-
-
-def wanted_way() -> Way | None:
-    """The way of drawing stars that HILSTAR_DRAW wants, None for the machine's own. InputError for
-    another word.
-    """
-    wanted = os.environ.get(WAY_VARIABLE, "")
-    if not wanted:
-        return None
-    for way in WAYS:
-        if wanted == way:
-            return way
-    raise InputError(f"{WAY_VARIABLE}={wanted}: no way to draw stars; write {' or '.join(WAYS)}")
 
 
 class Backend(ABC):

@@ -13,9 +13,8 @@ import numpy.typing as npt
 from glcontext import egl
 
 from hilstar.basics.errors import InputError, MachineError, NotThereError, did_you_mean
-from hilstar.basics.units import GL_VERSIONS
-from hilstar.display.exact import COMPUTE_VERSION
-from hilstar.display.render.backend import EGL_LIBRARY, wanted_way
+from hilstar.basics.units import COMPUTE_VERSION, GL_VERSIONS
+from hilstar.display.render.way import EGL_LIBRARY, wanted_way
 
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 Context = moderngl.Context

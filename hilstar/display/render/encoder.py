@@ -17,10 +17,10 @@ from hilstar.basics.arrays import Float32Array
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import held
 from hilstar.basics.resources import resource_path
-from hilstar.display.quantise import Panel, PixelQuantiser, code_table, level_dtype
-from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import PixelQuantiser, code_table, level_dtype
 from hilstar.display.render.context import is_software, pinned, shares_memory
-from hilstar.display.render.light_units import Planes
+from hilstar.display.render.target import MAX_SIDES, Planes, SpriteSide, SpriteSides
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
 from hilstar.optics.psf import Psf

@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, IntArray
 from hilstar.display.balance import SUMS, Balance
-from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
+from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left, Turn
 from hilstar.display.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
-from hilstar.display.render.backend import Target, Turn
 from hilstar.display.render.context import pinned
 from hilstar.display.render.encoder import (
     LevelTexture,
@@ -27,7 +26,7 @@ from hilstar.display.render.encoder import (
     set_uniforms,
     write,
 )
-from hilstar.display.render.light_units import Planes
+from hilstar.display.render.target import Planes, Target
 from hilstar.display.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.optics.psf import PIXEL_VARIANCE
 from hilstar.optics.sprites import FrameLight

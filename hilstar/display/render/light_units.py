@@ -5,16 +5,14 @@ the same for both ways of drawing them. Nothing here needs OpenGL.
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from hilstar.basics.arrays import Float32Array
-from hilstar.display.quantise import Panel, RoundQuantiser
-from hilstar.display.render.backend import SpriteSides, Target
+from hilstar.display.quantise import RoundQuantiser
+from hilstar.display.render.target import Planes, SpriteSides
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
+from hilstar.optics.sprites import FrameLight
 
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
 MAX_FINE_SUM = 2**52  # what a float64 holds exactly, and as much again for rounding
@@ -32,81 +30,6 @@ WINGS, DENSER_WINGS = 128, 8
 # 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
-APART_DTYPE = np.dtype([*SPRITE_DTYPE.descr, ("primaries_e_per_s", "<f4", 3)])
-
-
-@dataclass(frozen=True, slots=True)
-class Planes:
-    """The planes of an image: one, or one for each of the primaries that a target drives apart.
-
-    `panels` are theirs, `share` (planes,) what of white's light each has, and `footprint_px` the
-    side of sprites that hold the light of all: it lies up to `margin_px` from the star.
-    """
-
-    panels: tuple[Panel, ...]
-    share: tuple[float, ...]
-    footprint_px: int
-    margin_px: tuple[float, float]
-    defines: tuple[str, ...]
-    places_px: list[tuple[float, float]]
-
-    @classmethod
-    def of(cls, target: Target) -> "Planes":
-        """Those of a target."""
-        white_e_per_s, panel = target.flux_at_white_e_per_s, target.panel()
-        panels = target.primaries or (() if panel is None else (panel,))
-        away = np.abs(np.array(target.places_px)).max(axis=0) if target.primaries else np.zeros(2)
-        defines = ["APART"] * bool(target.primaries) + ["OFFSETS"] * bool(away.any())
-        share = tuple(one.flux_at_white_e_per_s / white_e_per_s for one in panels)
-        margin_px = float(away[0]), float(away[1])
-        side_px = target.psf.footprint_px + 2 * math.ceil(max(margin_px))
-        return cls(
-            panels,
-            share,
-            side_px,
-            margin_px,
-            tuple(defines),
-            [(float(x), float(y)) for x, y in target.places_px],
-        )
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """A sprite's: SPRITE_DTYPE, with the light of each primary after it."""
-        return APART_DTYPE if self.apart else SPRITE_DTYPE
-
-    @property
-    def apart(self) -> bool:
-        """Whether there is a plane for each primary."""
-        return len(self.panels) > 1
-
-    @property
-    def texel(self) -> int:
-        """Components of a texel."""
-        return 4 if self.apart else 1
-
-    @property
-    def lit(self) -> Panel:
-        """A grey panel whose first level takes as little light as that of any plane."""
-        first, share = min(
-            zip(self.panels, self.share, strict=True),
-            key=lambda one: float(one[0].response.threshold[0]),
-        )
-        return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
-
-    def packed(self, sprites: FrameLight) -> FrameLight:
-        """Sprites with `dtype`; their rate is then that of the white that they need for the
-        primary that needs most.
-        """
-        if not self.apart or sprites.primaries is None:
-            return sprites
-        data = np.empty(len(sprites), dtype=APART_DTYPE)
-        words = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
-        words[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
-        data["primaries_e_per_s"] = sprites.primaries
-        data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(
-            axis=1
-        )
-        return replace(sprites, data=data)
 
 
 def edges_of(planes: Planes) -> list[Float32Array]:

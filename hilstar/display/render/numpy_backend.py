@@ -16,18 +16,13 @@ from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import MachineError, NotThereError
 from hilstar.display.quantise import UnquantisedFrame, level_dtype
 from hilstar.display.render.aids import LINE_SHARE, lay_over
-from hilstar.display.render.backend import (
-    EGL_LIBRARY,
-    NO_FRAME,
-    Backend,
-    ScreenView,
-    Target,
-    as_maps,
-    wanted_way,
-)
+from hilstar.display.render.backend import NO_FRAME, Backend, ScreenView, as_maps
 from hilstar.display.render.cpu_stars import CpuImage, CpuStars
-from hilstar.display.render.light_units import LightUnits, Planes
+from hilstar.display.render.light_units import LightUnits
 from hilstar.display.render.reference import extended_image
+from hilstar.display.render.target import Planes, Target
+from hilstar.display.render.turns import levels_by_plane, quantisers_of
+from hilstar.display.render.way import EGL_LIBRARY, wanted_way
 from hilstar.display.response import Levels
 from hilstar.optics.extended import ExtendedLight
 from hilstar.optics.sprites import FrameLight
@@ -100,7 +95,7 @@ class NumpyBackend(Backend):
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self._quantisers = target.quantisers()
+        self._quantisers = quantisers_of(target)
         self.path = "NumPy"
         self._stars: CpuStars | None = None
         self._level_image = np.empty((0, 0, 0), dtype=np.uint8)
@@ -125,7 +120,7 @@ class NumpyBackend(Backend):
         if self._stars is not None and self._draws_stars_alone(self._stars, sprites):
             return
         if self._quantisers:
-            self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
+            self._levels = levels_by_plane(self.target, sprites, partial(self._plane, frame))
 
     def _build_stars(self) -> None:
         """Make what draws the nearest levels of frames of stars alone."""

@@ -16,16 +16,7 @@ from hilstar.basics.arrays import Float32Array
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
 from hilstar.display.quantisers import QUANTISERS
-from hilstar.display.render.backend import (
-    NO_FRAME,
-    Backend,
-    Path,
-    ScreenView,
-    SpriteSide,
-    SpriteSides,
-    Target,
-    as_maps,
-)
+from hilstar.display.render.backend import NO_FRAME, Backend, Path, ScreenView, as_maps
 from hilstar.display.render.context import (
     MAX_WRITTEN_BYTES,
     Context,
@@ -51,7 +42,9 @@ from hilstar.display.render.encoder import (
     sprites_array,
 )
 from hilstar.display.render.exact_pass import ExactPass, PixelSums
-from hilstar.display.render.light_units import LightUnits, Planes
+from hilstar.display.render.light_units import LightUnits
+from hilstar.display.render.target import Planes, SpriteSide, SpriteSides, Target
+from hilstar.display.render.turns import levels_by_plane, quantisers_of, turns_of
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
 from hilstar.optics.sprites import FrameLight
@@ -176,7 +169,7 @@ class Renderer(Backend):
                 levels=self._levels,
                 shares=self._shares,
             )
-            self._exact_passes = [chosen(turn, left=left) for turn in target.in_turn()]
+            self._exact_passes = [chosen(turn, left=left) for turn in turns_of(target)]
         if by_star is None or self._exact_passes:
             self._encoder = Encoder(ctx, self._linear, self._levels, planes, self._by_pixel)
             lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
@@ -398,7 +391,9 @@ class Renderer(Backend):
             return
         if not self._exact:
             self._exact = {
-                k: one for k, one in target.quantisers().items() if isinstance(one, ExactQuantiser)
+                k: one
+                for k, one in quantisers_of(target).items()
+                if isinstance(one, ExactQuantiser)
             }
         for one in self._exact_passes:
             if (left := one.left) is not None:
@@ -407,8 +402,8 @@ class Renderer(Backend):
         if sprites is not None and sprites.extended:
             floor = self._floor(sprites, by_star.floor_turn(frame)).read()
         on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
-        self._exact_levels = target.by_plane(
-            sprites, lambda k, light: self._exact[k].levels(light, on[k])
+        self._exact_levels = levels_by_plane(
+            target, sprites, lambda k, light: self._exact[k].levels(light, on[k])
         )
         levels.write(self._exact_levels)
 

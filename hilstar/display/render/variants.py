@@ -12,9 +12,9 @@ import moderngl
 import numpy as np
 
 from hilstar.basics.units import NS_PER_MS
-from hilstar.display.render.backend import Target
 from hilstar.display.render.encoder import Shares, build_program, splat_program
 from hilstar.display.render.renderer import FIRST_CAPACITY, Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import Levels
 from hilstar.optics.psf import pixel_shares
 from hilstar.optics.sprites import FrameLight

@@ -47,7 +47,8 @@ from hilstar.server.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.server.bench.certificate import Certificate, bench_certificate
 from hilstar.server.bench.config import BenchConfig
-from hilstar.server.record.commanded import NOT_SHOWN, Commanded, CommandedRun, read_commanded
+from hilstar.server.record.commanded import Commanded
+from hilstar.server.record.commanded_run import NOT_SHOWN, CommandedRun, read_commanded
 from hilstar.server.record.ledger_records import AnswerRecord, answer_records, config_of, read_head
 
 MISSED_CYCLES = 1.5  # a longer time between right answers is an outage

@@ -27,8 +27,9 @@ from hilstar.instruments.simulate.star_finder import star_finder
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_stars, star_glass
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
+from hilstar.server.bench.star_glass import star_glass
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.tracker.centroiders import star_places
 
 BINS, MIN_IN_BIN = 5, 20

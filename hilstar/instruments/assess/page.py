@@ -34,14 +34,8 @@ from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import Slice
 from hilstar.instruments.assess.budget import Axes
-from hilstar.instruments.assess.report import (
-    COUNT,
-    bench_text,
-    display_text,
-    limit_text,
-    lines_of,
-    rows_of,
-)
+from hilstar.instruments.assess.figure_rows import COUNT, limit_text
+from hilstar.instruments.assess.report import bench_text, display_text, lines_of, rows_of
 
 AVAILABLE = 0.99  # a smaller availability is a warning
 MAX_POINTS = 4000

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import astuple, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,11 +11,10 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import write_csv
 from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import DisplayCost, Slice
-from hilstar.instruments.assess.budget import Axes, Decomposed, DecomposedRun
+from hilstar.instruments.assess.budget import Axes, DecomposedRun
+from hilstar.instruments.assess.figure_rows import FigureRow, limit_rows, limit_text, part_rows
 from hilstar.server.bench.certificate import Certificate, off_by
 
-COUNT = "1"  # the unit of counts and shares in the tables
-PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 MAX_NAMED = 10
 MAX_SHARE_SIGMA = 0.5  # a share of the display's error that is less sure says nothing
 
@@ -71,60 +70,6 @@ def bench_part(certificate: Certificate, parts: DecomposedRun) -> dict[str, Any]
         found["off_arcsec"] = {name: own for name, (own, _) in each.items()}
         found["share_of_bias"] = {name: share for name, (_, share) in each.items()}
     return found
-
-
-class FigureRow(NamedTuple):
-    """A row of budget.csv, here and in a campaign's directory: None is an empty cell."""
-
-    quantity: str
-    axis: str
-    value: float | int | None
-    unit: str = COUNT
-    low_95: float | None = None
-    high_95: float | None = None
-
-
-def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRow]:
-    """The rows of bias, field-of-view error, pixel error and noise; without values where `parts`
-    is None.
-    """
-    for k, axis in enumerate("xyz"):
-        value = None if parts is None else float(parts.bias_arcsec[k])
-        yield FigureRow(
-            "bias",
-            axis,
-            value,
-            "arcsec",
-            *([] if parts is None else parts.intervals.bias[:, k].tolist()),
-        )
-    for part, name in PARTS.items():
-        axes = (
-            noise_arcsec if part == "noise" or parts is None else getattr(parts, f"{part}_arcsec")
-        )
-        for k, axis in enumerate(("cross", "roll")):
-            value = getattr(axes, axis)
-            ends = (
-                []
-                if parts is None or value is None
-                else getattr(parts.intervals, part)[:, k].tolist()
-            )
-            yield FigureRow(name, axis, value, "arcsec", *ends)
-
-
-def limit_rows(limit: Axes | None) -> Iterator[FigureRow]:
-    """The rows of the smallest noise that the tracker's stars allow."""
-    for axis in ("cross", "roll") if limit is not None else ():
-        yield FigureRow("limit of the tracker's stars", axis, getattr(limit, axis), "arcsec")
-
-
-def limit_text(limit: Axes | None) -> str:
-    """The smallest noise that a tracker's stars allow, in words."""
-    if limit is None or limit.cross is None or limit.roll is None:
-        return "not known"
-    return (
-        f"{limit.cross:.3g} arcsec across, {limit.roll:.3g} about the boresight (Cramer-Rao, one"
-        " exposure at rest)"
-    )
 
 
 def rows_of(found: Assessment) -> Iterator[FigureRow]:

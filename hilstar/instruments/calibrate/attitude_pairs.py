@@ -35,7 +35,7 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.text_tables import finite_numbers, is_valid, read_rows
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
-from hilstar.server.record.commanded import read_commanded
+from hilstar.server.record.commanded_run import read_commanded
 
 MAX_TABLE_BYTES = 200_000_000
 MAX_ROWS = 100_000

@@ -3,27 +3,23 @@ a display.
 """
 
 import logging
-import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory, write_whole
 from hilstar.basics.reading import read_text
 from hilstar.display.render.backend import ScreenView
 from hilstar.display.render.presenter import Presenter, level_texture, window_context
 from hilstar.display.response import code_dtype
 from hilstar.instruments.calibrate.measurements import CHANNELS, PRIMARIES
+from hilstar.instruments.calibrate.until_key import stays_until_key
 from hilstar.server.bench.frame_files import write_codes_png
-
-if TYPE_CHECKING:
-    from hilstar.display.window.window import Window
 
 MAX_PLAN_BYTES = 100_000_000
 # relative to white: a little beyond three decades, so that nothing is extrapolated there
@@ -31,7 +27,6 @@ MIN_PLANNED_LIGHT = 10**-3.2
 # relative to white; levels below it are planned twice as often, because the black level drowns them
 FAINT_LIGHT = 1e-2
 PATCHES_PER_REFERENCE = 8  # between two rounds of black, half and white
-KEY_POLL_S = 0.02
 PATCH_SHARE = 1 / 3  # relative to the screen's smaller side
 
 
@@ -211,26 +206,3 @@ def show_patches(
             if not stays_until_key(window, presenter, seconds):
                 return shown
     return len(planned)
-
-
-def stays_until_key(window: "Window", presenter: Presenter, seconds: float | None) -> bool:
-    """Present until space is pressed or `seconds` are over; False if q was pressed. Raises
-    MachineError without the display.
-    """
-    end_s = math.inf if seconds is None else time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        presenter.present()
-        window.swap()
-        window.look_at_events()
-        while window.keys:
-            key = window.keys.popleft()
-            if key in {"q", "escape"}:
-                return False
-            if key == "space":
-                return True
-        if window.gone is not None:
-            raise MachineError(window.gone)
-        if window.closing:
-            return False
-        time.sleep(KEY_POLL_S)
-    return True

@@ -36,7 +36,7 @@ from hilstar.instruments.campaign.plan import (
     changed_bench,
     parameters,
 )
-from hilstar.instruments.campaign.solvers import CentroidErrors, SolverAnswer
+from hilstar.instruments.campaign.solver_answer import CentroidErrors, SolverAnswer
 from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.simulate.batch import faulty_exposure, view_at
 from hilstar.instruments.simulate.simulator import Exposure, FaultyExposure, Simulator

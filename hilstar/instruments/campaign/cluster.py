@@ -20,8 +20,9 @@ from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.basics.process.closing import Closing
-from hilstar.instruments.campaign.pool import Backlog, Done, Lost, Task
-from hilstar.instruments.campaign.session import Answered, Identity, Job, Session, difference
+from hilstar.instruments.campaign.backlog import Backlog, Done, Lost, Task
+from hilstar.instruments.campaign.job import Answered, Identity, Job, difference
+from hilstar.instruments.campaign.session import Session
 
 _here = threading.local()
 INSTALL = "install it: pip install 'hilstar[dask]'"

@@ -23,7 +23,7 @@ from hilstar.basics.pages import (
     paragraph,
     table_of,
 )
-from hilstar.instruments.assess.report import COUNT, FigureRow, limit_text
+from hilstar.instruments.assess.figure_rows import COUNT, FigureRow, limit_text
 
 PAGE_FILE = "campaign.html"
 MAX_REASONS = 20

@@ -32,8 +32,14 @@ from hilstar.basics.rotation import from_rotation_vectors, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.bench_effects import noise_limit
 from hilstar.instruments.assess.budget import Axes, Decomposed, assess_cases, axes_of_variance
+from hilstar.instruments.assess.figure_rows import (
+    PARTS,
+    FigureRow,
+    limit_rows,
+    limit_text,
+    part_rows,
+)
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.assess.report import PARTS, FigureRow, limit_rows, limit_text, part_rows
 from hilstar.instruments.campaign.page import PAGE_FILE, write_campaign_page
 from hilstar.instruments.campaign.store import failures, file_sha256
 from hilstar.server.bench.bench_file import BenchFile

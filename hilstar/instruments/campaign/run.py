@@ -11,7 +11,9 @@ import msgspec
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.reading import MAX_TOML_BYTES, read_text
+from hilstar.instruments.campaign.backlog import MAX_DEATHS, Backlog, Task
 from hilstar.instruments.campaign.cases import CaseMaker, bench_columns, columns, failed, first_row
+from hilstar.instruments.campaign.job import Identity, Job, files_sha256, identity_of
 from hilstar.instruments.campaign.plan import (
     BENCH_KEYS,
     MAX_BENCH_CASES,
@@ -21,8 +23,8 @@ from hilstar.instruments.campaign.plan import (
     grid_levels,
     parse_plan,
 )
-from hilstar.instruments.campaign.pool import MAX_DEATHS, Backlog, Pool, Task
-from hilstar.instruments.campaign.session import Identity, Job, Session, files_sha256, identity_of
+from hilstar.instruments.campaign.pool import Pool
+from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.store import (
     About,
     Directory,

@@ -12,7 +12,6 @@ import shlex
 import signal
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,16 +27,17 @@ from hilstar.basics.process.user_code import UserCodeError, user_function
 from hilstar.basics.rotation import multiply, normalise
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.campaign.plan import TRACKER_PSF, Centroiding
+from hilstar.instruments.campaign.solver_answer import CentroidErrors, SolverAnswer
 from hilstar.instruments.simulate.glass import told_psf
 from hilstar.instruments.simulate.live_exposure import LiveTracker
 from hilstar.instruments.simulate.pictures import write_dn_picture
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.instruments.simulate.star_finder import crowded, nearest
 from hilstar.optics.psf import GaussianPsf, Psf
-from hilstar.server.bench.build import StarGlass, star_glass
 from hilstar.server.bench.cameras import flight_camera, tracker_psf
 from hilstar.server.bench.config import GAUSSIAN
 from hilstar.server.bench.config.hardware import TrackerOptics
+from hilstar.server.bench.star_glass import StarGlass, star_glass
 from hilstar.tracker.centroiders import Places, psf_places
 from hilstar.tracker.centroids import (
     CentroidSettings,
@@ -65,35 +65,6 @@ class SolverFault(Exception):
 
 
 SolvedTracker = Simulator | DisplayTracker | LiveTracker  # whose images are solved
-
-
-@dataclass(frozen=True, slots=True)
-class CentroidErrors:
-    """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus
-    true, of matched stars.
-
-    `stars` are on the detector, `matched` of them were found within MATCH_PX, and `false` finds
-    belong to no star. Errors are those of stars that are neither clipped, nor at the edge, nor
-    crowded; `v_mag` (n,) are their magnitudes, `star` their rows.
-    """
-
-    stars: int
-    found: int
-    matched: int
-    false: int
-    dx_px: FloatArray
-    dy_px: FloatArray
-    v_mag: FloatArray
-    star: npt.NDArray[np.void]
-
-
-@dataclass(frozen=True, slots=True)
-class SolverAnswer:
-    """An attitude, or None and the reason; from the centroider also the centroids' errors."""
-
-    q_icrs_to_cam: FloatArray | None
-    why: str = ""
-    star_errors: CentroidErrors | None = None
 
 
 class Solver(Protocol):

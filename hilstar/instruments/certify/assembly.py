@@ -29,15 +29,11 @@ from hilstar.instruments.certify.model import Deviations, Figures, reference_sta
 from hilstar.instruments.certify.readings import Reader, dot_places, geometry_of
 from hilstar.instruments.certify.structure import in_time, lasting_root
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import (
-    bench_calibration,
-    catalogue_choice,
-    star_flux,
-    star_kinds,
-    star_rates,
-)
 from hilstar.server.bench.catalogue import sigma_instrument_mag
 from hilstar.server.bench.config.certify import TrackerReferenceSettings
+from hilstar.server.bench.monitor import bench_calibration
+from hilstar.server.bench.star_light import catalogue_choice
+from hilstar.server.bench.star_rates import star_flux, star_kinds, star_rates
 from hilstar.sky.facts import errors_of, motion_at
 from hilstar.sky.star_table import choose_catalog, table_facts
 

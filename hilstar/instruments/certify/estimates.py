@@ -37,7 +37,7 @@ from hilstar.instruments.certify.readings import (
 from hilstar.instruments.certify.structure import Cells, Structure, in_place, in_time, lasting_root
 from hilstar.optics.camera import field_terms
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_calibration
+from hilstar.server.bench.monitor import bench_calibration
 
 EVEN_DEGREES = (4, 6, 8, 10)
 BETTER_P = 0.001  # by the F test: a larger degree is taken below it

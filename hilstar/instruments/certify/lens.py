@@ -20,7 +20,7 @@ from hilstar.instruments.calibrate.geometric.dots import DotPlan
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.instruments.certify.readings import DotReadings, geometry_of
 from hilstar.instruments.certify.structure import TINY, Cells, Structure, in_place
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera, field_terms
 from hilstar.server.bench.bench_file import BenchFile
 

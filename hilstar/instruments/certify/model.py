@@ -24,10 +24,11 @@ from hilstar.instruments.certify.readings import (
     in_true_image,
     white_of,
 )
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_calibration, open_bench
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.frame import Bench, Frame
+from hilstar.server.bench.monitor import bench_calibration
 
 ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are taken
 # in sprites: stars nearer than this share pixels; a star's own pixels

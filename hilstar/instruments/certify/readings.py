@@ -27,15 +27,11 @@ from hilstar.instruments.calibrate.geometric.calibration import dot_sigma_px, ps
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.instruments.calibrate.latency import pair, swap_to_square_ms
 from hilstar.instruments.calibrate.plan import Patch
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import (
-    bench_calibration,
-    calibration_source,
-    open_bench,
-    orientation_of,
-)
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import bench_camera, tracker_camera, tracker_psf
+from hilstar.server.bench.monitor import bench_calibration, calibration_source, orientation_of
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 # from dot to dot: a dot that moved by half of it would be taken for its neighbour

@@ -24,9 +24,9 @@ from hilstar.optics.camera import Lens
 from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of, write_glass
 from hilstar.optics.psf import GaussianPsf, read_psf
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
-from hilstar.server.bench.build import bench_optics
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.glass import glass_in
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.sky.spectrum import Curve
 
 GRID = 4  # field points along each side of the PSF file

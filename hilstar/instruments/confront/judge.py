@@ -23,7 +23,7 @@ from hilstar.instruments.confront.sky import planets_seen
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.layers.view import STILL
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_moving
+from hilstar.server.bench.star_light import bench_moving
 from hilstar.sky.bodies.passes import Cone
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 

@@ -73,9 +73,10 @@ from hilstar.instruments.confront.star_psf import (
 )
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_channels, bench_optics, channel_rates, site_air
 from hilstar.server.bench.config.sky import SiteSettings
 from hilstar.server.bench.site import site_glow_e_per_s_sr
+from hilstar.server.bench.star_light import site_air
+from hilstar.server.bench.star_rates import bench_channels, bench_optics, channel_rates
 from hilstar.sky.air import SiteAir, air_mass
 from hilstar.sky.spectrum import Curve
 from hilstar.tracker.settings import DetectorSettings

@@ -13,9 +13,10 @@ import numpy.typing as npt
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_optics, catalogue_choice
 from hilstar.server.bench.config.bench_config import UNIX_JD, jyear
 from hilstar.server.bench.site import Ground, site_refraction
+from hilstar.server.bench.star_light import catalogue_choice
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.sky.air import air_mass
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.facts import errors_of, sigma_v_mag

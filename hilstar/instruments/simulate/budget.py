@@ -15,11 +15,13 @@ from hilstar.basics.arrays import IntArray
 from hilstar.basics.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 from hilstar.display.balance import Balance
+from hilstar.display.panel import Panel
 from hilstar.display.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.display.primaries import PRIMARIES, ChannelMatrix, channel_matrix, reddest_nm
-from hilstar.display.quantise import Panel
-from hilstar.server.bench.build import bench_primaries, named_channels
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.server.bench.frame import Bench, clipping_hip, named
+from hilstar.server.bench.monitor import bench_primaries
+from hilstar.server.bench.star_rates import named_channels
 from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectral_types import class_shares
@@ -236,7 +238,8 @@ def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     found = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
         wanted, stars = (bright * flux_ratio(mag)).astype(np.float32), fainter(sprites, mag)
-        shown = shown_by(target.quantisation, frames, panel, wanted, stars, balance)
+        kind = QUANTISERS[target.quantisation]
+        shown = shown_by(kind, frames, panel, wanted, stars, balance)
         found.append((mag, judge.errors(shown, flux_ratio(mag))))
         if not np.isfinite(found[-1][1].flux_mag).all():
             break

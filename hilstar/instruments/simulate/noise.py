@@ -34,8 +34,9 @@ from hilstar.optics.layers.truth import truth_table
 from hilstar.optics.layers.view import STILL, View
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_stars, star_flux, star_rates
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
+from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.bench.star_rates import star_flux, star_rates
 from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import FAMILY, Centroider, star_places
 from hilstar.tracker.centroids import CentroidSettings

@@ -10,10 +10,11 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import propagate
 from hilstar.basics.units import NS_PER_S
-from hilstar.display.quantise import Panel, primary_lights
-from hilstar.instruments.simulate.optics import BenchGeometry
-from hilstar.optics.frame_motion import Scan
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import primary_lights
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.layers.view import View
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.config import Tracker
 from hilstar.server.bench.frame import Bench
 from hilstar.server.sync import SHORTEST_LIT

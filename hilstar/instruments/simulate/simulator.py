@@ -19,12 +19,12 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.display.render.backend import Target
 from hilstar.display.render.numpy_backend import headless_context, open_backend
+from hilstar.display.render.target import Target
 from hilstar.instruments.simulate.shutter import rolled
 from hilstar.optics.camera import Camera, linear_shares
 from hilstar.optics.exposure_motion import MIDDLE_S, own_row_s
-from hilstar.optics.frame_motion import EVERY, Scan
+from hilstar.optics.frame_motion import EVERY
 from hilstar.optics.layers.bodies import disc_stars
 from hilstar.optics.layers.fault_kinds import CosmicRays, Now
 from hilstar.optics.layers.fault_light import FaultView
@@ -40,23 +40,18 @@ from hilstar.optics.layers.truth import (
 from hilstar.optics.layers.view import STILL, Canvas, View
 from hilstar.optics.paths import Paths
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight, by_channel, join_sprites, shares_by_bv, without_stars
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import (
-    StarGlass,
-    bench_channels,
-    bench_optics,
-    bench_sources,
-    bench_stars,
-    moved,
-    star_glass,
-)
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.config.bench_config import sky_jd
 from hilstar.server.bench.fault_views import tracker_view
 from hilstar.server.bench.glass import say_once
 from hilstar.server.bench.scenario import Scenario, Timetable
+from hilstar.server.bench.star_glass import StarGlass, star_glass
+from hilstar.server.bench.star_light import bench_sources, bench_stars, moved
+from hilstar.server.bench.star_rates import bench_channels, bench_optics
 from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light

@@ -21,14 +21,11 @@ from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import to_matrix
 from hilstar.display.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.quantise import LitLight, Panel, lit_light, primary_levels
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import LitLight, lit_light, primary_levels
 from hilstar.display.response import Response, table_response
-from hilstar.instruments.simulate.optics import (
-    BenchGeometry,
-    DisplayColours,
-    TwinOptics,
-    seen_primaries,
-)
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.optics import DisplayColours, TwinOptics, seen_primaries
 from hilstar.instruments.simulate.shutter import rolled, rolling_light
 from hilstar.instruments.simulate.simulator import TrackerBackground
 from hilstar.optics.camera import Camera
@@ -36,10 +33,11 @@ from hilstar.optics.layers.faults import FaultLayer
 from hilstar.optics.layers.view import STILL, View
 from hilstar.optics.sprites import shares_at
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import open_bench, primary_panels
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import ideal_monitor, real_monitor, tracker_camera
 from hilstar.server.bench.config import Verify
 from hilstar.server.bench.frame import Bench, Frame
+from hilstar.server.bench.primary_panels import primary_panels
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.mosaic import CHANNELS, in_pixels, software_image
 

@@ -26,8 +26,8 @@ from hilstar.basics.charts import (
 )
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_S
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.instruments.study.row_charts import (
     HIDDEN,
     ChartSpec,
@@ -46,7 +46,8 @@ from hilstar.optics.extended import DiscView, Pose, disc_lights
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import join_sprites, pack_sprites
 from hilstar.server.bench.frame import Bench
-from hilstar.sky.bodies.disc import Disc, lunar_share
+from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.shapes import lunar_share
 
 REFRESH_HZ = 60.0
 EPOCH: Table = {"epoch_utc": "2026-11-21T00:00:00Z"}

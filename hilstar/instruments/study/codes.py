@@ -12,6 +12,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, write_records
 from hilstar.basics.units import flux_ratio
 from hilstar.display.balance import AS_USUAL, Balance
+from hilstar.display.panel import Panel
 from hilstar.display.phases import (
     USUAL_PSF,
     WHITE,
@@ -21,8 +22,14 @@ from hilstar.display.phases import (
     phase_image,
     shown_by,
 )
-from hilstar.display.quantise import EXPOSURE_FRAMES, Panel, dither_levels, mask_turn, shown_light
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import (
+    EXPOSURE_FRAMES,
+    Quantisation,
+    dither_levels,
+    mask_turn,
+    shown_light,
+)
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.response import (
     Response,
     Weights,
@@ -135,8 +142,9 @@ def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list
     errors = []
     for mag in mags:
         wanted, share = fainter(sprites, mag), flux_ratio(mag)
+        kind = QUANTISERS[way.method]
         shown = shown_by(
-            way.method, way.frames, panel, (bright * share).astype(np.float32), wanted, balance
+            kind, way.frames, panel, (bright * share).astype(np.float32), wanted, balance
         )
         errors.append(judge.errors(shown, share))
     return errors

@@ -38,19 +38,15 @@ from hilstar.instruments.study.sweep import Judged, Load, OtherWork, in_turn
 from hilstar.optics.glass.glass_psf import NodeSpline
 from hilstar.optics.psf import GaussianPsf, Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from hilstar.server.bench.build import (
-    StarGlass,
-    bench_channels,
-    bench_colours,
-    bench_optics,
-    bench_stars,
-    named_channels,
-    open_bench,
-)
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_psf
 from hilstar.server.bench.colours import Colours, warmth
 from hilstar.server.bench.config.hardware import TrackerOptics
 from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.primary_panels import bench_colours
+from hilstar.server.bench.star_glass import StarGlass
+from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.bench.star_rates import bench_channels, bench_optics, named_channels
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, load_library
 from hilstar.sky.spectral_types import CLASSES, LETTERS, class_shares, read_types, star_types
 from hilstar.sky.spectrum import load_curve

@@ -25,7 +25,8 @@ from hilstar.instruments.study.settings import (
     study_bench,
 )
 from hilstar.instruments.study.sweep import NOT_JUDGED, Judged, Load, OtherWork, Spent, in_turn
-from hilstar.optics.frame_motion import CameraTurn, Scan, swept_sprites
+from hilstar.optics.frame_motion import CameraTurn, swept_sprites
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.code_errors import NO_THRESHOLD
 from hilstar.server.bench.config.render import DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX
 from hilstar.server.bench.frame import Bench

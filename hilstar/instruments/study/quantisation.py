@@ -25,8 +25,8 @@ from hilstar.basics.charts import (
 from hilstar.basics.units import flux_ratio
 from hilstar.display.phases import USUAL_PSF, WHITE
 from hilstar.display.quantise import EXPOSURE_FRAMES
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.instruments.study import codes
 from hilstar.instruments.study.row_charts import PairSpec, SeriesLook, draw_pairs, name_places

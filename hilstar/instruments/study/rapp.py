@@ -20,8 +20,9 @@ from hilstar.instruments.study.fields import Field, fields_of
 from hilstar.instruments.study.settings import study_optics
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import bench_optics, bench_stars
 from hilstar.server.bench.cameras import tracker_camera
+from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.sky.electrons import (
     REFERENCE_TEMPERATURE_K,
     Optics,

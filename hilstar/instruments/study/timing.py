@@ -27,11 +27,12 @@ from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
 from hilstar.display.quantise import shown_light
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import Levels
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
-from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.shutter import S_PER_US
 from hilstar.instruments.study import settings
 from hilstar.instruments.study.predictors import Movement, attitude_at
@@ -45,12 +46,12 @@ from hilstar.instruments.study.row_charts import (
 )
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.exposure_motion import Motion, smeared_sprites
-from hilstar.optics.frame_motion import Scan
 from hilstar.optics.layers.view import STILL, View
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import scan_of
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
+from hilstar.server.bench.monitor import scan_of
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 
 STRIPES_RADEC_ROLL_DEG = (84.0, 0.0, 0.0)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import magnitude
 from hilstar.display.calibration import Calibration
-from hilstar.instruments.simulate.optics import BenchGeometry, Mirror
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry, Mirror
 from hilstar.instruments.simulate.star_finder import (
     WING_SIGMAS,
     Matched,

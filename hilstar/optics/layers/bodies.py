@@ -20,8 +20,9 @@ from hilstar.optics.extended import (
     Shear,
     disc_lights,
 )
-from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, slowed
-from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, slowed
+from hilstar.optics.layers.view import POINT_PX, Canvas, View
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight
 from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
 from hilstar.sky.stars import Stars
@@ -29,9 +30,6 @@ from hilstar.sky.stars import Stars
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
-# A wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85
-# px by 0.2 %.
-POINT_PX = 0.2
 HIDDEN = 0.005  # a star or a body is not drawn if less than this share of its light comes through
 MAX_POSES = 7  # camera poses at which a disc is drawn in a frame
 # a disc of a larger radius is drawn at one pose, in the middle of the time, which bounds the work

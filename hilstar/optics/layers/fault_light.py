@@ -20,7 +20,6 @@ from hilstar.basics.rotation import direction_of, to_matrix
 from hilstar.basics.units import NS_PER_S, flux_ratio, magnitude
 from hilstar.optics import extended
 from hilstar.optics.camera import Camera
-from hilstar.optics.frame_motion import Scan
 from hilstar.optics.layers.fault_kinds import (
     CosmicRays,
     FalseStar,
@@ -34,10 +33,11 @@ from hilstar.optics.layers.fault_kinds import (
     PointLight,
     StarGone,
 )
-from hilstar.optics.layers.layers import StarLayer
+from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.stray_light import gradient_image, map_image, read_map
 from hilstar.optics.layers.view import Canvas
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import AddedLight, FrameLight, pack_sprites
 from hilstar.sky.catalog import star_names
 from hilstar.sky.stars import Stars

@@ -20,7 +20,7 @@ from hilstar.optics.layers.fault_kinds import (
     StarGone,
 )
 from hilstar.optics.layers.fault_light import FaultView
-from hilstar.optics.layers.layers import no_light
+from hilstar.optics.layers.star_layer import no_light
 from hilstar.optics.layers.view import View
 from hilstar.optics.sprites import AddedLight, FrameLight, with_sprites
 from hilstar.sky.stars import BODY_CELL_RAD, CellGrid, Stars

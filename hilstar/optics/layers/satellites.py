@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilstar.optics.frame_motion import slowed
-from hilstar.optics.layers.bodies import POINT_PX
-from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.layers.view import POINT_PX, Canvas, View
 from hilstar.optics.sprites import FrameLight
 from hilstar.optics.trails import (
     EVERY,

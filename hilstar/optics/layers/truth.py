@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import FloatArray, IntArray, with_columns
 from hilstar.basics.rotation import to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.bodies import disc_stars
@@ -77,25 +75,6 @@ def truth_table(
         # Back to the catalogue's decimals from float32.
         truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
     return truth
-
-
-def with_columns(
-    truth: npt.NDArray[np.void], added: Mapping[str, npt.NDArray[Any]], rows: IntArray | None = None
-) -> npt.NDArray[np.void]:
-    """Rows (n,) with columns more, of values of all rows or of `rows` (k,); others have NaN or
-    False.
-    """
-    where = np.arange(len(truth)) if rows is None else rows
-    found = np.zeros(
-        len(truth),
-        dtype=[*truth.dtype.descr, *((name, values.dtype) for name, values in added.items())],
-    )
-    for name in truth.dtype.names or ():
-        found[name] = truth[name]
-    for name, values in added.items():
-        found[name] = False if values.dtype == np.bool_ else np.nan
-        found[name][where] = values
-    return found
 
 
 def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> npt.NDArray[np.void]:

@@ -10,10 +10,15 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import Motion
-from hilstar.optics.frame_motion import CameraTurn, Scan
+from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight
 from hilstar.sky.stars import Stars
+
+# A wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85
+# px by 0.2 %.
+POINT_PX = 0.2
 
 STILL = np.zeros(3)
 AT_ONCE = Scan()

@@ -15,13 +15,8 @@ from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import STDOUT, whole_file
 from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import (
-    StarRates,
-    bench_optics,
-    catalogue_choice,
-    star_kinds,
-    star_rates,
-)
+from hilstar.server.bench.star_light import catalogue_choice
+from hilstar.server.bench.star_rates import StarRates, bench_optics, star_kinds, star_rates
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Photometry, star_temperatures_k
 from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag

@@ -17,9 +17,10 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import flux_ratio
 from hilstar.display.balance import Balance, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.phases import MARGIN_PX, WHITE, fainter, phase_image, shown_by
-from hilstar.display.quantise import Panel
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import Quantisation
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.response import Response
 from hilstar.optics.frame_motion import NODES_PER_SIGMA, POINT_SIGMA
 from hilstar.optics.paths import node_counts, nodes_of
@@ -346,7 +347,8 @@ class _Search:
         of_tiles = np.kron(share.reshape(PHASES, PHASES), np.ones((grid.tile_px, grid.tile_px)))
         linear = (grid.bright * of_tiles).astype(np.float32)
         sprites = fainter(grid.sprites, np.repeat(mags, grid.sprites.per_star))
-        image = shown_by(self._method, stars.frames, self._panel, linear, sprites, self._balance)
+        quantiser = QUANTISERS[self._method]
+        image = shown_by(quantiser, stars.frames, self._panel, linear, sprites, self._balance)
         flux_mag = self._beyond[0] * np.abs(grid.judge.errors(image, share, ()).flux_mag)
         star = int(flux_mag.argmax())
         of_flux = Corner(float(flux_mag[star]), None, grid.phases, star, float(mags[star]), span)

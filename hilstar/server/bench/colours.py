@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray, with_columns
 from hilstar.basics.errors import InputError
 from hilstar.display.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
 from hilstar.optics.extended import shifted
 from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
-from hilstar.optics.layers.truth import with_columns
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight, extended_by_share, shares_at, shares_of_sprites
 from hilstar.sky.catalog import Catalog

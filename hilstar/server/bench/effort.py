@@ -5,6 +5,8 @@ of the parts add up, and all parts share one tolerance: the cheapest combination
 is within it.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -14,16 +16,22 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.display.balance import AS_USUAL, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.phases import USUAL_PSF
-from hilstar.display.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantiser
-from hilstar.display.quantisers import BY_COST, QUANTISERS, Quantisation
-from hilstar.display.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
+from hilstar.display.quantise import EXPOSURE_FRAMES, LevelCost, Quantisation, Quantiser
+from hilstar.display.quantisers import BY_COST, QUANTISERS
+from hilstar.display.render.backend import level_cost
+from hilstar.display.render.target import MAX_SIDES, SpriteSide, SpriteSides
 from hilstar.display.response import Response
 from hilstar.optics.psf import MAX_CUT, Psf
 from hilstar.server.bench.code_errors import CodeErrors, CodeStars, code_stars, worst_errors
-from hilstar.server.bench.config import RenderSettings
+from hilstar.server.bench.config import (
+    RenderSettings,
+)
 from hilstar.server.bench.least_psf import MAG_PER_SHARE, Choice
 from hilstar.tracker.centroiders import FAMILY, Centroider
+
+TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
 
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of
 # stars meet is a code lower

@@ -9,13 +9,13 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.fault_light import FaultCamera, FaultView
 from hilstar.optics.layers.faults import FaultLayer
-from hilstar.optics.layers.layers import StarLayer
+from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.view import Canvas
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import star_rates
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import NO_SCENARIO, FaultSchedule, Scenario
+from hilstar.server.bench.star_rates import star_rates
 from hilstar.sky.stars import Stars, aberrate
 
 if TYPE_CHECKING:

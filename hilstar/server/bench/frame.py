@@ -20,13 +20,13 @@ from hilstar.basics.rotation import normalise, propagate
 from hilstar.basics.units import magnitude
 from hilstar.display.calibration import Calibration
 from hilstar.display.footprints import FootprintMap, star_losses_mag
-from hilstar.display.quantise import Panel, Quantiser, shown_light
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantiser, shown_light
 from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import Backend, linear_light
 from hilstar.display.response import Codes, Levels, code_dtype
 from hilstar.optics.camera import Camera
 from hilstar.optics.extended import LightMap
-from hilstar.optics.frame_motion import Scan
 from hilstar.optics.layers.bodies import BodyLayer, disc_stars
 from hilstar.optics.layers.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.optics.layers.truth import (
@@ -39,6 +39,7 @@ from hilstar.optics.layers.truth import (
 )
 from hilstar.optics.layers.view import STILL, Canvas, Layer, View
 from hilstar.optics.psf import Psf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import (
     CLIP_TOLERANCE,
     FrameLight,
@@ -49,6 +50,7 @@ from hilstar.optics.sprites import (
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.colours import Colours
 from hilstar.server.bench.config import BenchConfig, Vector
+from hilstar.server.bench.drawn import Drawn
 from hilstar.server.bench.effort import Effort
 from hilstar.server.bench.least_psf import Choice
 from hilstar.sky.stars import Stars, split_by_rate
@@ -57,6 +59,7 @@ if TYPE_CHECKING:
     from hilstar.optics.layers.faults import FaultLayer
     from hilstar.sky.bodies.disc import Disc
     from hilstar.sky.bodies.moving import MovingSky
+from hilstar.display.render.aids import AidLevels
 
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
@@ -105,39 +108,6 @@ class Frame:
     def linear(self) -> Float32Array:
         """The light of all channels together, float32 (height, width), electrons per second."""
         return self.light[0] if len(self.light) == 1 else np.asarray(self.light.sum(axis=0))
-
-
-class Drawn:
-    """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by
-    HIP number or a body's name.
-    """
-
-    def __init__(
-        self, renderer: Backend, sprites: FrameLight | None, clipped_hip: tuple[int | str, ...] = ()
-    ) -> None:
-        self.sprites = sprites
-        self.clipped_hip = clipped_hip
-        self.star_count = 0 if sprites is None else sprites.star_count
-        self._renderer = renderer
-
-    @property
-    def capped(self) -> int:
-        """How many stars' paths are coarser than they should be (see `scene.frame_motion`)."""
-        return 0 if self.sprites is None else self.sprites.capped
-
-    @property
-    def rate_cam_rad_s(self) -> FloatArray | None:
-        """The turn along which the stars' paths were drawn (3,), cam components; None where they
-        are points.
-        """
-        return None if self.sprites is None else self.sprites.rate_cam_rad_s
-
-    @cached_property
-    def levels(self) -> Levels:
-        """The levels (see `Bench.code_values`), read back when they are first asked for; the
-        next draw overwrites them.
-        """
-        return self._renderer.levels()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -610,4 +580,12 @@ def colour_line(bench: Bench) -> str | None:
     return (
         "[monitor.primaries] xy_r, xy_g and xy_b: the primaries' spectra are Gaussians of about"
         " those chromaticities, so all colours are approximate; measure the spectra, and write file"
+    )
+
+
+def aid_levels_of(bench: Bench) -> AidLevels:
+    """The aids' levels on a bench."""
+    x_px, y_px = bench.camera.boresight_px
+    return AidLevels(
+        bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px))
     )

@@ -11,15 +11,16 @@ import numpy as np
 from hilstar.basics.reading import read_text
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.optics.camera import Camera
-from hilstar.optics.layers.bodies import POINT_PX
+from hilstar.optics.layers.view import POINT_PX
 from hilstar.server.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.server.bench.config.bench_config import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
 from hilstar.server.bench.site import Ground
-from hilstar.sky.bodies.disc import EARTH
 from hilstar.sky.bodies.kernel import Kernel
 from hilstar.sky.bodies.light import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
-from hilstar.sky.bodies.orbit import TLE_ADVICE, VERSION_KEY, Geocentre, OemOrbit, Orbit, TleOrbit
+from hilstar.sky.bodies.oem import VERSION_KEY, OemOrbit
+from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, Orbit, TleOrbit
+from hilstar.sky.bodies.shapes import EARTH
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.stars import total_and_colours
 

@@ -18,10 +18,12 @@ from hilstar.basics.errors import InputError
 from hilstar.display.calibration import load_calibration
 from hilstar.display.response import Response
 from hilstar.optics.psf import GaussianPsf
-from hilstar.server.bench.build import bench_stars, calibration_source, white_of
 from hilstar.server.bench.config import GAUSSIAN, RenderSettings
 from hilstar.server.bench.effort import BEST, Effort, Light, plan_effort
 from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.monitor import calibration_source
+from hilstar.server.bench.scene import white_of
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.stars import Stars
 
 BITS = (10, 12, 14, 16)

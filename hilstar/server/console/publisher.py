@@ -25,12 +25,12 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.version import __version__
 from hilstar.optics.sprites import brightest
 from hilstar.server.bench.certificate import certificate_number
-from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.console import messages, protocol
 from hilstar.server.console.listener import PageListener
 from hilstar.server.console.overlay import OverlayScene, colour_notes, overlay_of
 from hilstar.server.console.page_process import Listeners, PageProcess
-from hilstar.server.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.server.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests
 from hilstar.server.pointing import POINTING
 from hilstar.server.record.ledger_records import MAX_CENTROIDS
 

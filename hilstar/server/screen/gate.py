@@ -22,9 +22,10 @@ from hilstar.display.window.output_settings import findings
 from hilstar.display.window.this_monitor import identity_here
 from hilstar.display.window.window import Window, WindowSettings
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import open_bench, orientation_of
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.config import Monitor
 from hilstar.server.bench.measured_on import SHOWN_ANYWAY, MonitorCheck, check_monitor
+from hilstar.server.bench.monitor import orientation_of
 from hilstar.server.screen.screen import DrawBudget, Screen
 
 GATE_FRAMES = 120

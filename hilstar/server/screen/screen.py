@@ -17,8 +17,9 @@ from hilstar.display.render.backend import ScreenView
 from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.watch import presented_as
 from hilstar.display.window.window import Window
-from hilstar.server.bench.build import orientation_of
-from hilstar.server.bench.frame import Bench, Drawn
+from hilstar.server.bench.drawn import Drawn
+from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.monitor import orientation_of
 from hilstar.server.operator import GAMMA, Aids, Operator, SwitchRequests
 from hilstar.server.pacer import Moment, Pacer, Presented
 

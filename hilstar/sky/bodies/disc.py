@@ -13,19 +13,8 @@ relative to `normal_e_per_s_sr`:
 - `uniform`: 1.
 
 The law gives a disc its shape, the body's magnitude its sum: `of_rate` scales the one to the other.
-
-The Earth from an orbit: where its disc is seen, and the radiance that its magnitude from afar gives
-its ground.
-
-Mallama and Hilton's magnitude is that of the whole globe from afar. It is taken as a Lambert
-sphere's whose ground is as bright as that needs at each phase; near, the same ground is seen, and
-what is in view adds up to another sum. There are no
-clouds, seas, city lights, moonlight or airglow.
-
-Sizes, flattening, poles and laws of the light of Sun, Moon, Earth and planets.
 """
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Literal
@@ -33,51 +22,15 @@ from typing import Literal
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import direction_of
-from hilstar.basics.units import LIGHT_KM_S, flux_ratio
-from hilstar.sky.bodies.light import EARTH_CURVE_DEG, KM_PER_AU, body_v_mag, phase_angle_deg
 
 Law = Literal["uniform", "lambert", "lunar-lambert", "limb-darkened"]
 SOLAR_LIMB = (0.30, 0.93, -0.23)
-# The Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; clipped to 0 and 1 beyond the
-# fitted range.
-LUNAR_SHARE = (1.0, -0.019, 2.42e-4, -1.46e-6)
 # Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux,
 # tests/unit/sky/bodies/test_disc.py
 QUADRATURE = 40
 # scale heights over the limb: beyond, the Earth's air is 1e-8 deep along the ray, which no code
 # shows
 AIR_TOP = 20.0
-EARTH = "Earth"
-EQUATOR_KM, POLAR_KM = 6378.1366, 6356.7519  # IERS Conventions 2010, table 1.1
-MEAN_KM = math.sqrt(EQUATOR_KM * POLAR_KM)  # mean radius of the outline seen from the equator
-# Equatorial, Archinal et al. 2018 and, the Sun's, IAU 2015 Resolution B3
-RADII_KM = {
-    "Sun": 695_700.0,
-    "Moon": 1737.4,
-    "Mercury": 2440.53,
-    "Venus": 6051.8,
-    "Mars": 3396.19,
-    "Jupiter": 71_492.0,
-    "Saturn": 60_268.0,
-    "Uranus": 25_559.0,
-    "Neptune": 24_764.0,
-    EARTH: EQUATOR_KM,
-}
-# Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see:
-# the same source
-POLAR_RADII_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
-POLES_DEG = {
-    "Jupiter": (268.057, 64.495),
-    "Saturn": (40.589, 83.537),
-    "Uranus": (257.311, -15.175),
-    "Neptune": (299.36, 43.46),
-}
-LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
-NORTH = np.array([0.0, 0.0, 1.0])
-LOWEST_KM = 1.0  # an orbit below the ground is seen from here
-AT_CENTRE_KM = 1000.0  # an observer so near the centre has no place of its own: no Earth is seen
-DARK_V_MAG = 40.0  # where nothing in view is lit
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,90 +282,3 @@ def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
     """Places from -1 to 1 and weights (count,), kept: a frame asks for the same again."""
     place, weight = np.polynomial.legendre.leggauss(count)
     return place, weight
-
-
-def lunar_share(phase_deg: float) -> float:
-    """The Moon's share of Lommel-Seeliger's law at a phase angle."""
-    return float(np.clip(np.polynomial.polynomial.polyval(phase_deg, LUNAR_SHARE), 0.0, 1.0))
-
-
-# Molecules alone: the scale height of the US Standard Atmosphere 1976 over its lowest 20 km (7.3 to
-# 8.4 km), and the depth that Bodhaine et al. 1999 (J. Atmos. Oceanic Technol. 16, 1854) have at 550
-# nm. Dust is lower than rays that get through.
-AIR = Air(scale_km=8.0, depth=0.097)
-
-
-def at_centre(place_km: FloatArray) -> bool:
-    """Whether a place (3,) about the Earth's centre is that of an observer who is there."""
-    return float(np.linalg.norm(place_km)) < AT_CENTRE_KM
-
-
-def apparent_cone(seen_km: FloatArray, velocity_km_s: FloatArray) -> tuple[FloatArray, float]:
-    """The unit vector (3,) to the middle of the Earth's disc as seen, and the distance, km, at
-    which it is as wide.
-
-    `seen_km` (3,) is the vector to its centre and the velocity (3,) that about it: the Earth's own
-    drops out of light time and aberration. Every direction of the limb is aberrated by itself,
-    which keeps it a circle (Penrose 1959) about another middle.
-    """
-    distance_km = max(float(np.linalg.norm(seen_km)), EQUATOR_KM + LOWEST_KM)
-    towards = seen_km / float(np.linalg.norm(seen_km))
-    radius_rad = math.asin(EQUATOR_KM / distance_km)
-    beta = velocity_km_s / LIGHT_KM_S
-    along = float(beta @ towards)
-    middle = towards + math.cos(radius_rad) * (beta - along * towards)
-    return middle / np.linalg.norm(middle), EQUATOR_KM / math.sin(
-        radius_rad - along * math.sin(radius_rad)
-    )
-
-
-def earth_disc(
-    seen_km: FloatArray, from_sun_km: FloatArray, velocity_km_s: FloatArray, v0_e_per_s: float
-) -> Disc:
-    """The Earth's disc: `seen_km` and `velocity_km_s` as of `apparent_cone`, and the vector (3,)
-    from the Sun to the Earth.
-
-    A V of 0 gives `v0_e_per_s` electrons.
-    """
-    direction, distance_km = apparent_cone(seen_km, velocity_km_s)
-    sun_km = float(np.linalg.norm(from_sun_km))
-    return Disc(
-        name=EARTH,
-        direction=direction,
-        distance_km=distance_km,
-        equator_km=EQUATOR_KM,
-        polar_km=POLAR_KM,
-        pole=np.array([0.0, 0.0, 1.0]),  # 0.15 degrees from the pole of 2026: 0.1 km of the limb
-        sun=-from_sun_km / sun_km,
-        law="lambert",
-        normal_e_per_s_sr=_normal(sun_km, phase_angle_deg(from_sun_km, seen_km), v0_e_per_s),
-        air=AIR,
-    )
-
-
-def earth_light(disc: Disc, v0_e_per_s: float) -> tuple[float, float]:
-    """V and electrons per second of all that is seen of the Earth's ground."""
-    rate = disc.normal_e_per_s_sr * disc.law_integral_sr()
-    dark = v0_e_per_s * flux_ratio(DARK_V_MAG)
-    return -2.5 * math.log10(max(rate, dark) / v0_e_per_s), rate
-
-
-def _normal(sun_km: float, phase_deg: float, v0_e_per_s: float) -> float:
-    """The ground's radiance under the Sun at the zenith, electrons per second and steradian."""
-    phase_deg = min(phase_deg, EARTH_CURVE_DEG)
-    phase = math.radians(phase_deg)
-    # From 1 au, where a Lambert sphere's integral over its disc is a closed form
-    far_km = KM_PER_AU * np.array([math.cos(phase), math.sin(phase), 0.0])
-    rate = v0_e_per_s * flux_ratio(body_v_mag(EARTH, np.array([sun_km, 0.0, 0.0]), far_km, 2000.0))
-    return rate / (
-        2 / 3 * (MEAN_KM / KM_PER_AU) ** 2 * (math.sin(phase) + (math.pi - phase) * math.cos(phase))
-    )
-
-
-def pole(name: str) -> FloatArray:
-    """The unit vector (3,) of a body's north pole, ICRS axes; the ICRS's own of one that is
-    round.
-    """
-    if name not in POLES_DEG:
-        return NORTH
-    return direction_of(*POLES_DEG[name])

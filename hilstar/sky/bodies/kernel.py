@@ -15,8 +15,7 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import MachineError
-from hilstar.basics.units import LIGHT_KM_S
-from hilstar.sky.bodies.light import KM_PER_AU
+from hilstar.basics.units import KM_PER_AU, LIGHT_KM_S
 from hilstar.sky.stars import aberrate
 
 DAY_S = 86_400.0

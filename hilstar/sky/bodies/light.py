@@ -32,11 +32,10 @@ from numpy.polynomial.polynomial import polyval
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import direction_of
-from hilstar.basics.units import magnitude
+from hilstar.basics.units import KM_PER_AU, magnitude
 from hilstar.sky import electrons
 from hilstar.sky.spectrum import load_curve
 
-KM_PER_AU = 149_597_870.7
 SUN_V_MAG = -26.76  # at 1 au: Willmer 2018, ApJS 236, 47
 SUN_BV_MAG = 0.653  # the same source
 

@@ -18,20 +18,13 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 from hilstar.sky.air import SiteAir
-from hilstar.sky.bodies.disc import (
+from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.earth_disc import (
     DARK_V_MAG,
-    EARTH,
-    LAWS,
-    NORTH,
-    POLAR_RADII_KM,
-    RADII_KM,
-    Disc,
     apparent_cone,
     at_centre,
     earth_disc,
     earth_light,
-    lunar_share,
-    pole,
 )
 from hilstar.sky.bodies.kernel import (
     DAY_S,
@@ -44,6 +37,15 @@ from hilstar.sky.bodies.kernel import (
 from hilstar.sky.bodies.light import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
 from hilstar.sky.bodies.passes import Circumstances, Cone, Pass, Satellites, SkyAt
+from hilstar.sky.bodies.shapes import (
+    EARTH,
+    LAWS,
+    NORTH,
+    POLAR_RADII_KM,
+    RADII_KM,
+    lunar_share,
+    pole,
+)
 from hilstar.sky.stars import Stars, aberrate, with_bodies
 
 log = logging.getLogger(__name__)

@@ -1,30 +1,18 @@
 """Observers: the Earth's centre, or a satellite on an element set (two lines, or an OMM).
 
 SGP4 is that of Vallado et al. 2006, AIAA 2006-6753.
-
-A spacecraft's orbit by a CCSDS Orbit Ephemeris Message, 1.0 to 3.0 (CCSDS 502.0-B), in KVN.
-
-Its frame is ICRF, GCRF or EME2000 about the Earth; lines of a segment are joined by the Hermite
-polynomial through the four epochs about a time, places and velocities, whatever the message
-recommends. Accelerations and covariances are not used.
 """
 
 import importlib.util
 import logging
-import re
-import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
 
 import erfa
 import numpy as np
-import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, MachineError
-from hilstar.basics.units import NS_PER_S
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD, Tdb, tdb_of_utc
 from hilstar.sky.bodies.omm import is_omm, read_omm
 
@@ -32,23 +20,6 @@ LINE_LENGTH = 69
 TLE_ADVICE = "give a file with one two-line element set, or one OMM in JSON, XML or CSV"
 TURN_NS = 3600 * 10**9  # the equator's axes move by 0.006 arcsec an hour: 0.2 m of a low orbit
 log = logging.getLogger(__name__)
-
-VERSION_KEY = "CCSDS_OEM_VERS"
-OEM_ADVICE = "write an OEM in KVN about the Earth in ICRF, GCRF or EME2000"
-FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
-# TDB is within 2 ms, or 15 m, of TT
-TAI_TO_SCALE_S = {"TAI": 0.0, "GPS": -19.0, "TT": 32.184, "TDB": 32.184}
-EPOCH = re.compile(r"(\d{4})-(?:(\d\d)-(\d\d)|(\d{3}))T(\d\d):(\d\d):(\d\d(?:\.\d+)?)Z?", re.ASCII)
-YEARS, DAYS_OF_YEAR = range(1900, 2200), range(1, 367)
-NODES = 4  # 1e-6 km of a low orbit at four minutes
-# to beyond the Lagrange points; a state in metres is outside one of them
-MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3
-FAR_KM = 1.0  # half an arcsecond of the Moon
-TRIED = 50
-DAY_NS = 86_400 * NS_PER_S
-# magnitudes are those of a minute's beginning, places those of two steps
-UNSEEN_NS = 120 * NS_PER_S
-COUNTS = {7, 10}  # an epoch, place and velocity, perhaps an acceleration
 
 
 class Orbit(Protocol):
@@ -152,218 +123,3 @@ def icrs_from_teme(hour: int) -> FloatArray:
     cosine, sine = (f(erfa.ee06a(date.whole, date.part)) for f in (np.cos, np.sin))
     teme_to_true = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(erfa.pnm06a(date.whole, date.part).T @ teme_to_true)
-
-
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """One segment: its time scale, epochs (n,), ns since 1970 of that scale, and states (n, 6),
-    km and km/s, ICRS axes.
-    """
-
-    scale: str
-    t_ns: npt.NDArray[np.int64]
-    states: FloatArray
-
-
-class OemOrbit:
-    """The orbit in the text of a file `name`.
-
-    Raises InputError for a text that is none, or that has no epoch within a day of a UTC, ns since
-    1970, at which stars are placed. Where that is only the beginning of the `day` of what is shown,
-    the file need not cover it.
-    """
-
-    step_s = 2.0  # as for a `TleOrbit`
-
-    def __init__(self, text: str, name: str, utc_ns: int, day: bool = False) -> None:
-        self._name, self._segments, self._told = name, list(_segments(text, name)), False
-        self._stars_ns, self._unseen_ns = utc_ns, UNSEEN_NS if day else -1
-        if not self._segments:
-            raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
-        if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
-            spans = ", ".join(
-                " to ".join(_date(int(t)) for t in s.t_ns[[0, -1]]) + f" {s.scale}"
-                for s in self._segments[:5]
-            )
-            raise InputError(
-                f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}"
-            )
-        off_km = max(map(_off_km, self._segments))
-        if off_km > FAR_KM:
-            advice = "write epochs a few minutes apart"
-            log.warning(
-                "%s: between its epochs the orbit is off by some %.2g km; %s", name, off_km, advice
-            )
-
-    def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest
-        epoch, which is told once.
-        """
-        found = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
-        if (
-            not self._told
-            and _away_ns(found, utc_ns) > 0
-            and abs(utc_ns - self._stars_ns) > self._unseen_ns
-        ):
-            log.warning(
-                "%s: has no orbit at %s UTC; that of its nearest epoch is held",
-                self._name,
-                _date(utc_ns),
-            )
-            self._told = True
-        t_ns = int(np.clip(_time(found.scale, utc_ns), found.t_ns[0], found.t_ns[-1]))
-        return _at(found.t_ns, found.states, t_ns)
-
-
-def _away_ns(segment: Segment, utc_ns: int) -> int:
-    """How far a UTC is from what a segment covers; 0 within."""
-    t_ns = _time(segment.scale, utc_ns)
-    return max(int(segment.t_ns[0]) - t_ns, t_ns - int(segment.t_ns[-1]), 0)
-
-
-def _at(
-    times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int
-) -> tuple[FloatArray, FloatArray]:
-    """Place and velocity at a time by the NODES states (n, 6) about it."""
-    first = int(
-        np.clip(np.searchsorted(times_ns, t_ns) - NODES // 2, 0, max(0, len(times_ns) - NODES))
-    )
-    near = slice(first, first + NODES)
-    from scipy.interpolate import KroghInterpolator
-
-    # An epoch that stands twice gives its place first and then its velocity.
-    twice_s = np.repeat((times_ns[near] - t_ns) / NS_PER_S, 2)
-    place_and_velocity = states[near].reshape(-1, 3)
-    place, velocity = KroghInterpolator(twice_s, place_and_velocity).derivatives(0.0, der=2)
-    return place, velocity
-
-
-def _off_km(segment: Segment) -> float:
-    """How far the polynomial is off between epochs, km, by what it is at epochs that are held
-    out, where steps are longer.
-    """
-    inner = (
-        np.unique(np.linspace(1, len(segment.t_ns) - 2, TRIED).astype(int))
-        if len(segment.t_ns) > 2
-        else ()
-    )
-    worst_km, order = 0.0, 2 * min(NODES, len(segment.t_ns) - 1)
-    for k in inner:
-        near = [i for i in range(k - NODES, k + NODES + 1) if i != k and 0 <= i < len(segment.t_ns)]
-        place, _ = _at(segment.t_ns[near], segment.states[near], int(segment.t_ns[k]))
-        worst_km = max(worst_km, float(np.linalg.norm(place - segment.states[k, :3])))
-    return worst_km / float(2**order)
-
-
-def _segments(text: str, name: str) -> Iterator[Segment]:
-    meta: dict[str, str] = {}
-    rows: list[list[str]] = []
-    section = "header"
-    for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
-        if not line or line.split(maxsplit=1)[0] == "COMMENT":
-            continue
-        if line in {"META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP"}:
-            if line == "META_START":
-                yield from _segment(meta, rows, name)
-                meta, rows = {}, []
-            section = {"META_START": "metadata", "COVARIANCE_START": "covariance"}.get(line, "data")
-        elif section in {"header", "metadata"}:
-            key, equals, value = line.partition("=")
-            if not equals:
-                raise InputError(
-                    f"{name}:{number}: {line[:40]!r} in the {section}; write KEYWORD = value"
-                )
-            meta[key.strip()] = " ".join(value.upper().split())
-        elif section == "data":
-            words = line.split()
-            if len(words) not in COUNTS:
-                raise InputError(
-                    f"{name}:{number}: {line[:40]!r}; write an epoch, X Y Z (km) and X_DOT Y_DOT"
-                    " Z_DOT (km/s)"
-                )
-            rows.append([str(number), *words[:7]])
-    if section == "metadata":
-        raise InputError(f"{name}: ends in the metadata; is it cut off?")
-    yield from _segment(meta, rows, name)
-
-
-def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator[Segment]:
-    if "REF_FRAME" not in meta and not rows:
-        return  # the header
-    frame, centre, scale = (
-        meta.get(key, "missing") for key in ("REF_FRAME", "CENTER_NAME", "TIME_SYSTEM")
-    )
-    if frame not in FRAMES or centre != "EARTH":
-        raise InputError(
-            f"{name}: REF_FRAME is {frame[:40]} and CENTER_NAME {centre[:40]}; {OEM_ADVICE}"
-        )
-    if scale not in {"UTC", *TAI_TO_SCALE_S}:
-        raise InputError(
-            f"{name}: TIME_SYSTEM is {scale[:40]}; write UTC, {', '.join(TAI_TO_SCALE_S)}"
-        )
-    if len(rows) < 2:
-        raise InputError(f"{name}: a segment has {len(rows)} states; it needs two or more")
-    t_ns = np.array([_epoch_ns(row[1], f"{name}:{row[0]}") for row in rows], dtype=np.int64)
-    states = np.array([_numbers(row[2:], f"{name}:{row[0]}") for row in rows])
-    back = np.flatnonzero(np.diff(t_ns) <= 0)
-    if len(back):
-        raise InputError(
-            f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the"
-            " lines by time"
-        )
-    yield Segment(scale, t_ns, states)
-
-
-def _numbers(words: list[str], where: str) -> list[float]:
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = [np.nan] * 6
-    place, speed = np.abs(numbers[:3]), np.abs(numbers[3:])
-    if not ((place < MAX_KM).all() and (speed < MAX_KM_S).all() and np.linalg.norm(place) > MIN_KM):
-        raise InputError(
-            f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s"
-        )
-    return numbers
-
-
-def _epoch_ns(text: str, where: str) -> int:
-    """Nanoseconds from 1970 to an epoch in its own scale, every day 86400 s."""
-    match = EPOCH.fullmatch(text)
-    try:
-        if match is None:
-            raise ValueError
-        year, month, day, of_year, hour, minute, second = match.groups()
-        date = np.datetime64(f"{year}-{month}-{day}" if month else year, "D") + (
-            int(of_year or 1) - 1
-        )
-        inside = (
-            int(year) in YEARS
-            and int(of_year or 1) in DAYS_OF_YEAR
-            and int(hour) < 24
-            and int(minute) < 60
-        )
-        if not inside or float(second) >= 60:
-            raise ValueError
-        seconds = int(date.astype(np.int64)) * 86_400 + 3600 * int(hour) + 60 * int(minute)
-        return seconds * NS_PER_S + round(float(second) * NS_PER_S)
-    except ValueError:
-        raise InputError(
-            f"{where}: the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or"
-            " YYYY-DDDThh:mm:ss.f"
-        ) from None
-
-
-def _time(scale: str, utc_ns: int) -> int:
-    if scale == "UTC":
-        return utc_ns
-    year, month, day = (int(part) for part in _date(utc_ns)[:10].split("-"))
-    with warnings.catch_warnings():
-        # before 1960, and years after the last known leap second
-        warnings.simplefilter("ignore", erfa.ErfaWarning)
-        leap_s = float(erfa.dat(year, month, day, 0.0))
-    return utc_ns + round((leap_s + TAI_TO_SCALE_S[scale]) * NS_PER_S)
-
-
-def _date(t_ns: int) -> str:
-    return str(np.datetime64(t_ns, "ns").astype("datetime64[s]"))

@@ -30,7 +30,7 @@ from hilstar.display.geometry import (
     monitor_camera,
     write_geometry,
 )
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.twin import true_geometry
 from hilstar.optics.camera import Lens
 from hilstar.server.bench.bench_file import read_bench_file

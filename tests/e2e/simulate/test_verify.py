@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.display.quantise import Panel
+from hilstar.display.panel import Panel
 from hilstar.display.response import gamma_response, srgb_response, table_response
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.server.bench.bench_file import read_bench_file

@@ -21,9 +21,9 @@ from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
 from hilstar.display.calibration import read_toml
 from hilstar.instruments.certify.readings import white_of
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from hilstar.server.bench.build import bench_calibration
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.config.hardware import Monitor
+from hilstar.server.bench.monitor import bench_calibration
 from tests.support.any_bench.draw import DrawnBench, true_light
 
 STEPS = (

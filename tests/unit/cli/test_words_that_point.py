@@ -194,7 +194,7 @@ def test_certify_finds_the_example_of_the_truth(
         "certify", "gone.toml", "--virtual", "truth-example.toml", "-o", "certificate"
     )
     assert "gone.toml" in done.stderr
-    from hilstar.cli.first_light import virtual_truth
+    from hilstar.cli.image_source import virtual_truth
 
     found = virtual_truth(Path("truth-example.toml"))
     assert found is not None

@@ -9,7 +9,8 @@ import pytest
 
 from hilstar.display.exact import ExactQuantiser
 from hilstar.display.footprints import FootprintMap, star_losses_mag
-from hilstar.display.quantise import Panel, round_levels, shown_light
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import round_levels, shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf

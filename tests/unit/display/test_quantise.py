@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.display.panel import Panel
 from hilstar.display.quantise import (
     MASK_TURNS,
-    Panel,
     ThresholdCounter,
     blue_noise,
     dither_levels,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hilstar.display.calibration import load_calibration
-from hilstar.display.quantise import Panel, shown_light
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import gamma_response, srgb_response, table_response
 from hilstar.display.temporal import (

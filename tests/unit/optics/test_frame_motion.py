@@ -9,9 +9,10 @@ from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.render.reference import linear_image
 from hilstar.optics import sprites as sprites_module
-from hilstar.optics.frame_motion import EXTRA_SPRITES, CameraTurn, Orientation, Scan, swept_sprites
+from hilstar.optics.frame_motion import EXTRA_SPRITES, CameraTurn, swept_sprites
 from hilstar.optics.paths import MAX_NODES
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Orientation, Scan
 from hilstar.optics.sprites import clipped_sprites, make_sprites
 from tests.support.stars import stars_at
 

@@ -13,7 +13,7 @@ from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.optics import frame_motion
 from hilstar.optics.camera import Lens, ResidualField, bounded
-from hilstar.optics.frame_motion import CameraTurn, Scan, swept_sprites
+from hilstar.optics.frame_motion import CameraTurn, swept_sprites
 from hilstar.optics.paths import (
     LIMIT_PX,
     LIMIT_SHARE,
@@ -25,6 +25,7 @@ from hilstar.optics.paths import (
     points_within,
 )
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Scan
 from tests.support.stars import stars_at
 
 SIZE = (1920, 1080)

@@ -7,7 +7,8 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.display.footprints import FootprintMap
-from hilstar.display.render.backend import Target, as_maps
+from hilstar.display.render.backend import as_maps
+from hilstar.display.render.target import Target
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.optics.sprites import pack_sprites
 from hilstar.server.bench.least_psf import ONE_PSF, WHOLE, candidates

@@ -5,6 +5,7 @@ attitudes.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.basics.errors import InputError
 from hilstar.display.quantisers import QUANTISERS
 from hilstar.server.bench.config import AttitudeSettings, parse_config
+from hilstar.server.record import ledger_records
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FrameRecord
 from hilstar.server.replay import OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play
@@ -155,6 +157,22 @@ def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_atti
     assert [frame.attitude is None for frame in frames] == [k == 3 for k in range(10)]
     assert frames[7][2].rate_cam_rad_s is None
     assert frames[8][2].rate_cam_rad_s.tolist() == [0.0, 0.1, 0.0]
+
+
+def test_before_its_first_frame_a_ledger_s_frames_are_decoded_once(ledger, config, monkeypatch):
+    decoded = Counter()
+    read = ledger_records.read_messages
+
+    def counted(path, topic, *, tell=True):
+        for message in read(path, topic, tell=tell):
+            decoded[topic] += 1
+            yield message
+
+    monkeypatch.setattr(ledger_records, "read_messages", counted)
+    play = plan_play(ledger, Wanted(speed=MAX), config)
+    assert play.frame_count == 10
+    # all ten are looked through, and the first is read again where they are played
+    assert decoded[ledger_records.FRAME_TOPIC] == 10 + 1
 
 
 def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledger, config):

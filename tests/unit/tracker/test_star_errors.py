@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from hilstar.display.balance import Balance, Seen
+from hilstar.display.panel import Panel
 from hilstar.display.phases import (
     MARGIN_PX,
     WHITE,
@@ -18,7 +19,7 @@ from hilstar.display.phases import (
     phase_image,
     shown_by,
 )
-from hilstar.display.quantise import Panel
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf
@@ -44,7 +45,7 @@ def codes(method, mag, seen, sigma_px=SIGMA):
     return (
         wanted,
         shown_by(
-            method,
+            QUANTISERS[method],
             1,
             panel,
             wanted.astype(np.float32),

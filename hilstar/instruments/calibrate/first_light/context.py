@@ -20,6 +20,10 @@ from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.files import make_directory, write_whole
 from hilstar.basics.reading import NOT_JSON, exists, read_bytes
 from hilstar.basics.rotation import to_matrix
+from hilstar.display.calibration import (
+    Calibration,
+    load_calibration,
+)
 from hilstar.instruments.calibrate.first_light.image_sources import (
     ByHand,
     ImageSource,
@@ -29,7 +33,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
 )
 from hilstar.instruments.calibrate.geometric.calibration import psf_sigma_of
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file, with_key
 from hilstar.server.bench.cameras import (
@@ -39,6 +43,7 @@ from hilstar.server.bench.cameras import (
     tracker_camera,
 )
 from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.monitor import calibration_source
 from hilstar.server.sync import BeatSummary
 from hilstar.tracker.mosaic import software_image
 
@@ -435,3 +440,9 @@ class StepContext:
                 " exposure_s so"
             )
         return lower
+
+
+def calibration_of(context: StepContext) -> Calibration:
+    """The calibration that the bench file names."""
+    monitor = context.file.config.monitor
+    return load_calibration(calibration_source(monitor, context.file.folder), monitor.bits)

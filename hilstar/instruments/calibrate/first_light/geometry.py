@@ -47,7 +47,7 @@ from hilstar.instruments.calibrate.geometric.dots import (
 )
 from hilstar.instruments.calibrate.geometric.fit import FIELD_DEGREES
 from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
 
 # half the figure's side, relative to the smaller side of what both screen and tracker have

@@ -38,20 +38,21 @@ from hilstar.display.render.presenter import Presenter, level_texture, window_co
 from hilstar.display.window.this_monitor import identity_here
 from hilstar.instruments.calibrate.geometric.observed import read_image
 from hilstar.instruments.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import (
-    BenchGeometry,
     DisplayColours,
     Primary,
     TwinOptics,
     seen_primaries,
 )
 from hilstar.instruments.simulate.simulator import TrackerBackground
-from hilstar.optics.frame_motion import Orientation
+from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import calibration_source, open_bench, orientation_of
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.frame_files import png_of, write_codes_png
 from hilstar.server.bench.measured_on import check_monitor
+from hilstar.server.bench.monitor import calibration_source, orientation_of
 from hilstar.server.frame_feed import lit_codes
 from hilstar.server.genicam.camera import PREFIX, CameraError, GenicamCamera, chosen_format
 from hilstar.server.screen.gate import Timing, pass_gate

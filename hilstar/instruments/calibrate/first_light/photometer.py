@@ -30,8 +30,8 @@ from hilstar.instruments.calibrate.first_light.context import HOT_FILL, MAX_FILL
 from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.instruments.calibrate.measurements import COMMON
 from hilstar.instruments.calibrate.plan import Patch, in_channel
-from hilstar.instruments.simulate.optics import BenchGeometry
-from hilstar.server.bench.build import bench_calibration
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.server.bench.monitor import bench_calibration
 from hilstar.tracker.rounding import (
     STEP_PHASES,
     before_adc_dn,

@@ -13,7 +13,6 @@ from hilstar.basics.charts import INK, MUTED, chart
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
 from hilstar.display.calibration import (
-    Calibration,
     add_uniformity,
     load_calibration,
     primary_lights,
@@ -27,6 +26,7 @@ from hilstar.instruments.calibrate.first_light.context import (
     StepContext,
     StepNumber,
     StepOutcome,
+    calibration_of,
 )
 from hilstar.instruments.calibrate.first_light.photometer import (
     LONGEST_S,
@@ -42,13 +42,9 @@ from hilstar.instruments.calibrate.photometric import (
 )
 from hilstar.instruments.calibrate.plan import Patch, PlanSettings, plan_patches
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import (
-    bench_calibration,
-    bench_primaries,
-    calibration_source,
-    named_channels,
-)
 from hilstar.server.bench.config.bench_config import drives_apart
+from hilstar.server.bench.monitor import bench_calibration, bench_primaries, calibration_source
+from hilstar.server.bench.star_rates import named_channels
 from hilstar.tracker.settings import DetectorSettings
 
 SEED = 0
@@ -163,12 +159,6 @@ def shares_of_white(file: BenchFile) -> FloatArray:
         )
     matrix = channel_matrix(primaries, named_channels(file.config.tracker, file.folder), 1.0)
     return np.asarray(matrix.e_per_s.sum(axis=0))
-
-
-def calibration_of(context: StepContext) -> Calibration:
-    """The calibration that the bench file names."""
-    monitor = context.file.config.monitor
-    return load_calibration(calibration_source(monitor, context.file.folder), monitor.bits)
 
 
 def _response_figures(

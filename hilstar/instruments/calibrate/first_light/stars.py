@@ -34,9 +34,10 @@ from hilstar.instruments.verify.summary import verify as run_twin
 from hilstar.instruments.verify.verdict import Verdict as TwinVerdict
 from hilstar.instruments.verify.verdict import judge
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import calibration_source, open_bench
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import bench_camera, display_psf
 from hilstar.server.bench.config import Verify
+from hilstar.server.bench.monitor import calibration_source
 
 VERIFY_FIELDS, VERIFY_SEED = 3, 0
 LOST_SHARE = 0.1

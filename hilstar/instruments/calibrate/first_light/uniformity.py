@@ -27,10 +27,10 @@ from hilstar.instruments.calibrate.first_light.context import (
     StepNumber,
     StepOutcome,
     Verdict,
+    calibration_of,
 )
 from hilstar.instruments.calibrate.first_light.focus import dot_code
 from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, Pattern, black
-from hilstar.instruments.calibrate.first_light.photometry import calibration_of
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
 from hilstar.instruments.calibrate.warm_up import (
     AHEAD_S,
@@ -39,8 +39,8 @@ from hilstar.instruments.calibrate.warm_up import (
     judge_warm_up,
     watch_white,
 )
-from hilstar.instruments.simulate.optics import PIXELS_AT_ONCE, BenchGeometry
-from hilstar.server.bench.build import bench_calibration, calibration_source
+from hilstar.instruments.simulate.bench_geometry import PIXELS_AT_ONCE, BenchGeometry
+from hilstar.server.bench.monitor import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot

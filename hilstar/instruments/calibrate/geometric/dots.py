@@ -388,8 +388,8 @@ def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowe
     from hilstar.display.render.backend import ScreenView
     from hilstar.display.render.presenter import Presenter, level_texture, window_context
     from hilstar.display.window.window import Window, WindowSettings
-    from hilstar.instruments.calibrate.plan import stays_until_key
-    from hilstar.server.bench.build import orientation_of
+    from hilstar.instruments.calibrate.until_key import stays_until_key
+    from hilstar.server.bench.monitor import orientation_of
 
     orientation = orientation_of(monitor)
     screen_px = orientation.screen_px(monitor.resolution_px)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 
 from hilstar.basics.charts import two_digits
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import Quantisation
 from hilstar.instruments.study.chain.choices import Prediction
 from hilstar.instruments.study.chain.measuring import RSS, WHOLE, CombinationRow, ErrorPart
 from hilstar.instruments.study.sweep import Load

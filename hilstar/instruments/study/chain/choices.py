@@ -23,13 +23,14 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import normalise
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import Quantisation
 from hilstar.instruments.study.predictors import Movement
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import assembled, bench_stars
+from hilstar.server.bench.build import assembled
 from hilstar.server.bench.config import AttitudeSettings, BenchConfig, RenderSettings, SkySettings
 from hilstar.server.bench.config.sky import SpacecraftSettings
 from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.stars import split_by_rate
 
 # `held`: the newest sample's attitude. `rate`: carried on by the sample's rate. `two samples`: by

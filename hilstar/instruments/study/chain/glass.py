@@ -27,10 +27,10 @@ from hilstar.instruments.study.sweep import MAX_ROUNDS, in_turn, pareto_front
 from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import StarGlass
 from hilstar.server.bench.cameras import least_tracker_psf, tracker_psf
 from hilstar.server.bench.config import GAUSSIAN
 from hilstar.server.bench.least_psf import candidates
+from hilstar.server.bench.star_glass import StarGlass
 from hilstar.tracker.centroiders import star_places
 
 if TYPE_CHECKING:

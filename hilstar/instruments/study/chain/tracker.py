@@ -16,7 +16,8 @@ from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
 from hilstar.display.render.reference import add_stars
 from hilstar.instruments.assess.bench_effects import turn_between
-from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.star_finder import (
     MATCH_PX,
     StarFinder,

@@ -29,8 +29,8 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import held
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import StagedRenderer
 from hilstar.instruments.study.settings import FULL_HD, Table, Value, bench_text
 from hilstar.instruments.study.speed import report, tracker

@@ -16,8 +16,9 @@ import numpy as np
 
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import parse_plan
-from hilstar.instruments.campaign.session import OWN_THREADS, Job, Session, files_sha256
+from hilstar.instruments.campaign.session import OWN_THREADS, Session
 from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.instruments.study.speed.report import Cell, MethodTiming, Skipped, Spread

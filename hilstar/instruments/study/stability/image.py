@@ -18,12 +18,12 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.basics.units import flux_ratio, magnitude
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.quantise import Panel, shown_light
-from hilstar.display.quantisers import Quantisation
-from hilstar.display.render.backend import Target
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantisation, shown_light
 from hilstar.display.render.context import create_context
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.response import Levels, Response, srgb_response
 from hilstar.instruments.study.codes import AIMS
 from hilstar.instruments.study.stability import FailureCase, Figures

@@ -16,9 +16,9 @@ from scipy.integrate import quad_vec
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import LIGHT_M_S, flux_ratio, magnitude
 from hilstar.display.phases import WHITE, fainter, measure
-from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study.codes import (
     AIMS,
@@ -42,9 +42,10 @@ from hilstar.instruments.study.tradeoff.places import (
 from hilstar.instruments.study.trials import Figure, Trial, Trials
 from hilstar.optics.psf import MAX_CUT
 from hilstar.optics.sprites import FrameLight, make_sprites, pack_sprites
-from hilstar.server.bench.build import bench_calibration, brightest_peak_e_per_s
 from hilstar.server.bench.cameras import ideal_monitor
 from hilstar.server.bench.config import Monitor, RenderSettings, SkySettings
+from hilstar.server.bench.monitor import bench_calibration
+from hilstar.server.bench.scene import brightest_peak_e_per_s
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.spectrum import (

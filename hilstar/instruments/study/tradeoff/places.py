@@ -20,8 +20,8 @@ from hilstar.basics.rotation import angle_between_rad, normalise, to_matrix
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.phases import measure
-from hilstar.display.render.backend import Target
 from hilstar.display.render.reference import linear_image
+from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study.predictors import (
     JITTER,
@@ -39,9 +39,9 @@ from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight, pack_sprites
-from hilstar.server.bench.build import bench_stars
 from hilstar.server.bench.cameras import ideal_monitor, tracker_psf
 from hilstar.server.bench.config import BenchConfig, RenderSettings, read_config
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
 

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from hilstar.basics.charts import write_csv
-from hilstar.display.render.backend import Target
 from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
 from hilstar.instruments.study.sweep import Judged
 from hilstar.instruments.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
 from hilstar.instruments.study.tradeoff.places import (

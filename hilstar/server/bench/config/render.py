@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from hilstar.basics.toml_tables import Table
-from hilstar.display.quantisers import Quantisation
+from hilstar.display.quantise import Quantisation
 from hilstar.server.bench.config.values import Magnitude, NotNegative, Positive, Sigma
 
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is

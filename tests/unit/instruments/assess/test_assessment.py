@@ -24,8 +24,8 @@ from hilstar.instruments.simulate.noise import field_stars
 from hilstar.optics.glass.psf_file import glass_of, write_glass
 from hilstar.server.answers.pairing import LitFrame, LitFrames
 from hilstar.server.bench.bench_file import bench_file_of
-from hilstar.server.bench.build import bench_stars
 from hilstar.server.bench.cameras import tracker_camera
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.record.commanded import Commanded
 from hilstar.server.record.ledger_records import AnswerRecord
 from tests.support.benches import bench_text

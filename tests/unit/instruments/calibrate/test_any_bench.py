@@ -54,7 +54,8 @@ from hilstar.instruments.calibrate.geometric.dots import (
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.instruments.calibrate.scale import StarReading, scale_of
 from hilstar.instruments.certify.readings import dot_settings
-from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.optics.camera import Lens
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.bench_file import read_bench_file

@@ -37,8 +37,8 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
     on_screen,
 )
 from hilstar.instruments.calibrate.first_light.session import FirstLightSession, SessionStep
-from hilstar.instruments.simulate.optics import BenchGeometry
-from hilstar.optics.frame_motion import Orientation
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 from tests.support.damage import NO_JSON

@@ -37,7 +37,7 @@ from hilstar.instruments.calibrate.first_light.photometry import (
 from hilstar.instruments.calibrate.first_light.stars import scale, trend
 from hilstar.instruments.calibrate.geometric.observed import read_image
 from hilstar.instruments.calibrate.plan import Patch
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 

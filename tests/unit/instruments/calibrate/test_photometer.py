@@ -29,7 +29,7 @@ from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.measurements import read_measurements
 from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit_channel
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
-from hilstar.instruments.simulate.optics import BenchGeometry
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.rounding import before_adc_dn, cut_light, rounding_error, rounding_rms
 from tests.support.benches import TWIN, bench_text

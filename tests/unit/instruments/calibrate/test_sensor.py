@@ -15,8 +15,8 @@ from PIL import Image
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.sensor import import_emva, measure_sensor, write_sensor
-from hilstar.server.bench.build import bench_optics
 from hilstar.server.bench.config import read_config
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import SMALL_BENCH

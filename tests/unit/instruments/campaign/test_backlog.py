@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hilstar.instruments.campaign.backlog import MAX_DEATHS, Backlog
 from hilstar.instruments.campaign.plan import Design
-from hilstar.instruments.campaign.pool import MAX_DEATHS, Backlog
 from hilstar.instruments.campaign.store import Journal
 
 

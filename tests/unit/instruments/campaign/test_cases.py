@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import propagate
 from hilstar.instruments.campaign.cases import CaseMaker
+from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, parse_plan
-from hilstar.instruments.campaign.session import Job, Session, files_sha256
+from hilstar.instruments.campaign.session import Session
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here

@@ -13,7 +13,8 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.quantise import shown_light
 from hilstar.display.render.numpy_backend import NumpyBackend
-from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.glass.glass_psf import GlassPsf, regridded
 from hilstar.optics.glass.psf_file import glass_of, write_glass

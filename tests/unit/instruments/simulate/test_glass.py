@@ -17,17 +17,20 @@ from hilstar.instruments.campaign.plan import Centroiding, parse_plan
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.solvers import CENTROIDS, choose_solver
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.glass import told_psf
-from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.camera import Lens
 from hilstar.optics.glass.glass_psf import GlassPsf, NodeSpline
 from hilstar.optics.glass.psf_file import glass_of, write_glass
 from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import BAND_NM, StarGlass, bench_optics, bench_stars
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.glass import say_once
+from hilstar.server.bench.star_glass import BAND_NM, StarGlass
+from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.sky.electrons import electron_response
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m
 from hilstar.tracker.centroiders import psf_places, star_places

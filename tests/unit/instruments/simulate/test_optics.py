@@ -12,10 +12,11 @@ from scipy.special import ndtr
 
 from hilstar.basics.rotation import to_matrix
 from hilstar.display.geometry import monitor_camera
-from hilstar.display.quantise import Panel
+from hilstar.display.panel import Panel
 from hilstar.display.response import gamma_response, table_response
 from hilstar.instruments.simulate import optics as twin_optics
-from hilstar.instruments.simulate.optics import BenchGeometry, TwinOptics
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.verify.measure import on_screen_median
 from hilstar.optics.camera import Lens, bounded
 from hilstar.optics.psf import GaussianPsf, SampledPsf

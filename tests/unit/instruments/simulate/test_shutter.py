@@ -16,10 +16,11 @@ from hilstar.instruments.simulate.shutter import rolled
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.exposure_motion import Motion
-from hilstar.optics.frame_motion import Scan
-from hilstar.optics.layers.layers import StarLayer, light_of
+from hilstar.optics.layers.layers import light_of
+from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.sync import Exposures, seen_at
 from hilstar.tracker.detector import Detector

@@ -15,13 +15,13 @@ from numpy.polynomial.polynomial import polyval
 
 from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_optics, star_kinds, star_rates
 from hilstar.server.bench.catalogue import (
     bench_catalogue,
     nearest_neighbours,
     sigma_instrument_mag,
     write_catalogue,
 )
+from hilstar.server.bench.star_rates import bench_optics, star_kinds, star_rates
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry
 from hilstar.sky.facts import errors_of, sigma_v_mag

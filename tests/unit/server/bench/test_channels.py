@@ -21,8 +21,9 @@ from hilstar.instruments.compare import compare
 from hilstar.optics.extended import GlowLight, LightMap
 from hilstar.optics.sprites import AddedLight
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_channels, bench_optics, bench_stars, star_flux
 from hilstar.server.bench.frame_files import write_frame_fits
+from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.commands import run_hilstar_here

@@ -17,7 +17,7 @@ from hilstar.display.quantise import primary_lights
 from hilstar.instruments.simulate.live_exposure import LiveTracker
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.extended import LightMap, shifted
-from hilstar.optics.frame_motion import Orientation
+from hilstar.optics.scan import Orientation
 from hilstar.optics.sprites import by_primary
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.console.overlay import colour_notes

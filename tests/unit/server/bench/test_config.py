@@ -7,8 +7,8 @@ import re
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.server.bench.build import bench_optics
 from hilstar.server.bench.config import read_config
+from hilstar.server.bench.star_rates import bench_optics
 from tests.support.benches import ROOT, SMALL_BENCH
 
 # The bench file of the design's section 5, every key given (the values that choose between words:

@@ -24,7 +24,6 @@ from hilstar.server.bench.build import (
     measured_cost,
     open_bench,
     timed_frame_ms,
-    turning_of,
 )
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import (
@@ -38,6 +37,7 @@ from hilstar.server.bench.effort import (
 )
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
+from hilstar.server.bench.scene import turning_of
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here

@@ -10,8 +10,9 @@ from scipy.special import ndtr
 
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.instruments.simulate.budget import budget
-from hilstar.optics.frame_motion import CameraTurn, Scan, swept_sprites
+from hilstar.optics.frame_motion import CameraTurn, swept_sprites
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.build import load
 from tests.support.real_lens import SIZE, true_places_px, write_bench
 

@@ -10,7 +10,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.server.bench.bench_file import at_moment, dated, read_bench_file
-from hilstar.server.bench.build import bench_moving
+from hilstar.server.bench.star_light import bench_moving
 from tests.support.benches import bench_text
 from tests.support.satellites import some_orbits
 from tests.support.skies import STATION_TLE, moving_sky, utc_ns

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.server.bench.build import bench_stars
+from hilstar.server.bench.star_light import bench_stars
 from tests.support.benches import bench_text
 
 # JD 2461000.5 is 2025-11-21T00:00:00 UTC. The second star is at its faintest then, the third a

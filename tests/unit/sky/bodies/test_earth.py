@@ -7,9 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.basics.units import LIGHT_KM_S
-from hilstar.sky.bodies.disc import DARK_V_MAG, Disc, earth_disc, earth_light
-from hilstar.sky.bodies.light import KM_PER_AU, body_v_mag
+from hilstar.basics.units import KM_PER_AU, LIGHT_KM_S
+from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.earth_disc import DARK_V_MAG, earth_disc, earth_light
+from hilstar.sky.bodies.light import body_v_mag
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.stars import aberrate
 from tests.support.ray_traced.bodies import Body, lambert, limb

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.sky.bodies.orbit import OemOrbit
+from hilstar.sky.bodies.oem import OemOrbit
 from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 
 MINUTES = range(0, 1260, 60)

@@ -1,0 +1,45 @@
+"""A frame on the GPU, whose levels are read back when they are asked for."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.display.render.backend import Backend
+from hilstar.display.response import Levels
+from hilstar.optics.sprites import (
+    FrameLight,
+)
+
+
+class Drawn:
+    """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by
+    HIP number or a body's name.
+    """
+
+    def __init__(
+        self, renderer: Backend, sprites: FrameLight | None, clipped_hip: tuple[int | str, ...] = ()
+    ) -> None:
+        self.sprites = sprites
+        self.clipped_hip = clipped_hip
+        self.star_count = 0 if sprites is None else sprites.star_count
+        self._renderer = renderer
+
+    @property
+    def capped(self) -> int:
+        """How many stars' paths are coarser than they should be (see `scene.frame_motion`)."""
+        return 0 if self.sprites is None else self.sprites.capped
+
+    @property
+    def rate_cam_rad_s(self) -> FloatArray | None:
+        """The turn along which the stars' paths were drawn (3,), cam components; None where they
+        are points.
+        """
+        return None if self.sprites is None else self.sprites.rate_cam_rad_s
+
+    @cached_property
+    def levels(self) -> Levels:
+        """The levels (see `Bench.code_values`), read back when they are first asked for; the
+        next draw overwrites them.
+        """
+        return self._renderer.levels()

@@ -1,0 +1,134 @@
+"""The wavelengths of a PSF, as the light of a bench's stars has them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.optics.glass.glass_psf import NodeSpline
+from hilstar.optics.psf import Psf
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.star_rates import StarRates, bench_optics, channel_rates, star_kinds
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.electrons import (
+    Optics,
+)
+from hilstar.sky.spectrum import Curve
+from hilstar.sky.stars import (
+    Stars,
+)
+
+# Bands of a star's light as a glass sees it: twice as fine moves no share by over 1e-3
+# (tests/unit/instruments/simulate/test_glass.py)
+BAND_NM, KNOT_NM = 25.0, 5.0
+
+
+class StarGlass:
+    """The shares that a `psf`'s wavelengths have of the light of a bench's stars, through one
+    channel's `optics` or all.
+
+    The band is cut into narrow ones, whose electrons come from the same tables as a star's total,
+    so every model of
+    spectra (`[sky] brightness`, `spectrum`, `temperature`) counts here too.
+    """
+
+    def __init__(
+        self, file: BenchFile, psf: Psf, optics: Optics | None = None, band_nm: float = BAND_NM
+    ) -> None:
+        self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
+        self._catalog: Catalog | None = None
+        self._of_row = np.empty((0, 0))
+        self._bands: list[StarRates] = []
+        self._of_band = np.ones((0, 1))
+        if len(psf.wavelengths_nm) > 1:
+            flat = self._cut(
+                file, optics or bench_optics(file.config.tracker, file.folder), band_nm
+            )
+            if optics is not None and self._bands:
+                self._mean = flat @ self._of_band / flat.sum()
+
+    def _cut(self, file: BenchFile, optics: Optics, band_nm: float) -> FloatArray:
+        """Bands that overlap as triangles do, so that they sum to the tracker's own; each one's
+        response to even photons.
+        """
+        low_nm, high_nm = optics.range_nm
+        nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
+        fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
+        own_nm = optics.quantum_efficiency.wavelength_nm
+        knots_nm = np.union1d(
+            np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)]
+        )
+        efficiency = optics.quantum_efficiency(knots_nm)
+        shares, of_band, flat = NodeSpline(self.psf.wavelengths_nm)(knots_nm), [], []
+        for number in range(len(nodes_nm)):
+            part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
+            response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
+            if not response.any():
+                continue
+            try:
+                rates = channel_rates(
+                    file.config.sky,
+                    dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part)),
+                )
+            except InputError:
+                # so little light that some spectrum has none: the bands beside it stand for it
+                continue
+            self._bands.append(rates)
+            flat.append(response.sum())
+            of_band.append(response @ shares / flat[-1])
+        self._of_band = np.array(of_band)
+        return np.array(flat)
+
+    def shares(self, stars: Stars, which: IntArray) -> FloatArray:
+        """The shares (n, L) of stars at places (n,) of `stars`; those of light without a
+        spectrum where a place is negative.
+        """
+        if not self._bands:
+            return self._mean
+        if self._catalog is not stars.catalog:
+            self._catalog, self._of_row = (
+                stars.catalog,
+                np.full((len(stars.catalog), self._of_band.shape[1]), np.nan),
+            )
+        found = np.tile(self._mean, (len(which), 1))
+        rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
+        listed, body = rows >= 0, (rows < 0) & (which >= 0)
+        new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
+        if len(new):
+            some = stars.catalog.taken(new)
+            self._of_row[new] = self._through(
+                some.bv_mag, some.vi_mag, star_kinds(self._config, some)
+            )
+        found[listed] = self._of_row[rows[listed]]
+        if body.any():
+            bv_mag = stars.bv_mag[which[body]]
+            kind = (
+                np.full((len(bv_mag), 2), np.nan)
+                if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None
+                else None
+            )
+            found[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
+        return found
+
+    def shares_of(self, stars: Stars, hip: IntArray) -> FloatArray:
+        """The same by Hipparcos numbers (n,) of `stars`, 0 for a body."""
+        order = np.argsort(stars.hip)
+        at = np.minimum(np.searchsorted(stars.hip, hip, sorter=order), len(order) - 1)
+        return self.shares(stars, np.where(hip > 0, order[at], -1))
+
+    def _through(
+        self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None
+    ) -> FloatArray:
+        rates = np.stack(
+            [band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1
+        )
+        return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))
+
+
+def star_glass(file: BenchFile, psf: Psf, optics: Optics | None = None) -> StarGlass | None:
+    """The spectra of a bench's stars as `psf` has them; None for one that is the same for all."""
+    return StarGlass(file, psf, optics) if psf.by_colour else None

@@ -1,0 +1,196 @@
+"""The light of a bench's sky: stars, bodies, diffuse light and the air over a site."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.optics.layers.layers import Sources, light_of, seen_in, sky_layers
+from hilstar.optics.layers.truth import StarInView, brightest_in_view
+from hilstar.optics.layers.view import Canvas, View
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.cameras import (
+    tracker_camera,
+    tracker_psf,
+)
+from hilstar.server.bench.config import (
+    BenchConfig,
+)
+from hilstar.server.bench.config.bench_config import (
+    epoch_utc_ns,
+    has_observer,
+    sky_jd,
+)
+from hilstar.server.bench.star_rates import (
+    bench_channels,
+    bench_optics,
+    channel_rates,
+    star_flux,
+    star_kinds,
+    star_rates,
+)
+from hilstar.sky.air import SiteAir, dimmed_mag
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.electrons import (
+    star_temperatures_k,
+)
+from hilstar.sky.star_table import TableChoice, choose_catalog
+from hilstar.sky.stars import (
+    BV_MAG,
+    Stars,
+    aberrate,
+    make_stars,
+    total_and_colours,
+    unit_vectors_icrs,
+)
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
+SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
+
+
+def bench_sources(config: BenchConfig, folder: Path) -> Sources:
+    """The light of a bench's sky beside its stars. Raises InputError or MachineError."""
+    moving, diffuse = bench_moving(config, folder), config.sky.diffuse
+    if diffuse.map is None:
+        return Sources(moving)
+    # WCS and coordinates take 200 ms, which only a map needs
+    from hilstar.sky.diffuse import read_diffuse_map
+
+    one, bv_mag = np.ones(1), diffuse.bv_mag
+    v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, bv_mag * one, np.nan * one)[0])
+    faces = read_diffuse_map(folder / diffuse.map)
+    return Sources(
+        moving,
+        tuple(
+            dataclasses.replace(face, image=face.image * v0_e_per_s, bv_mag=bv_mag)
+            for face in faces
+        ),
+    )
+
+
+def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
+    """The bodies and the observer of a bench, None where its file has neither. Raises InputError
+    or MachineError.
+    """
+    if not has_observer(config):
+        return None
+    from hilstar.server.bench.moving import (
+        moving_sky,  # importing the ephemeris takes 50 ms, which only bodies and an observer need
+    )
+
+    return moving_sky(config, folder, bench_channels(config.tracker, folder))
+
+
+def moved(stars: Stars, moving: MovingSky | None) -> Stars:
+    """The stars with bodies among them at t = 0, in arrays that `moving` may change; without
+    `moving` the stars themselves.
+    """
+    return stars if moving is None else moving.among(stars)
+
+
+def catalogue_choice(config: BenchConfig, folder: Path) -> TableChoice:
+    """What `[sky] catalogue` names, and how it is read."""
+    sky = config.sky
+    source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
+    return TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
+
+
+def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
+    """The stars of a bench with their electron rates, which are computed only here, as
+    `moving`'s observer sees them.
+    """
+    sky = config.sky
+    epoch_utc_ns(config)  # which refuses one that a source was to give
+    faintest = math.inf if sky.variables == "phase" else sky.faintest_v_mag
+    chosen = choose_catalog(
+        dataclasses.replace(catalogue_choice(config, folder), faintest_v_mag=faintest)
+    )
+    if sky.variables == "phase":
+        chosen = chosen.at_phase(sky_jd(config, None))
+    catalog = chosen.brighter_than(sky.faintest_v_mag)
+    vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
+    if moving is not None:
+        vectors = moving.stars_seen(vectors, catalog.parallax_mas)
+    elif any(sky.observer_velocity_km_s):
+        vectors = aberrate(vectors, sky.observer_velocity_km_s)
+    temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
+    kind = star_kinds(config, catalog)
+    if kind is not None:
+        unread = int(np.isnan(kind).any(axis=1).sum())
+        note = (
+            f"{unread} of {len(catalog)} stars have no MK type of O to M, and their spectra by"
+            " colour alone"
+        )
+        catalog = dataclasses.replace(catalog, notes=(*catalog.notes, note))
+    through = star_flux(config, folder)
+    flux, by_bv = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind), None
+    if flux.shape[1] > 1:
+        by_bv = total_and_colours(through(0 * BV_MAG, BV_MAG, np.full_like(BV_MAG, np.nan))).colours
+    # the air takes of each star by its own spectrum
+    if config.site is not None and moving is not None:
+        moving.air = site_air(config, folder, catalog, kind)
+    return dataclasses.replace(
+        make_stars(catalog, vectors, temperature_k, flux), colours_by_bv=by_bv
+    )
+
+
+def site_air(
+    config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None
+) -> SiteAir:
+    """The air over `[site]` for stars of a catalogue. Raises InputError."""
+    # ERFA takes 30 ms
+    from hilstar.server.bench.site import (
+        Ground,
+        site_extinction,
+        site_glow_e_per_s_sr,
+        site_refraction,
+    )
+
+    if config.site is None:
+        raise AssertionError("the file has a site")
+    extinction, optics = site_extinction(config.site, folder), bench_optics(config.tracker, folder)
+    channels = bench_channels(config.tracker, folder)
+    v, bv, vi = (
+        np.append(c, one)
+        for c, one in zip((catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True)
+    )
+    kinds = None if kind is None else np.vstack([kind, np.full((1, 2), np.nan)])
+    dimming = [
+        dimmed_mag(
+            lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction
+        )
+        for one in channels
+    ]
+    return SiteAir(
+        up_at=Ground(config.site).up,
+        refraction_rad=site_refraction(config.site, optics),
+        height_m=config.site.height_m,
+        aperture_mm=config.tracker.aperture_mm,
+        dimming_mag=np.array(dimming, dtype=np.float32),
+        v_extinction_mag=float(extinction(np.array([V_NM]))[0]),
+        glow_e_per_s_sr=np.array([site_glow_e_per_s_sr(config, folder, one) for one in channels]),
+    )
+
+
+def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
+    """The `count` brightest stars and bodies that a bench's tracker sees in a view, the brightest
+    first.
+
+    Raises InputError or MachineError (see `bench_sources`).
+    """
+    canvas = Canvas(
+        tracker_camera(file.config.tracker, file.folder),
+        tracker_psf(file.config.tracker, file.folder),
+    )
+    sources = bench_sources(file.config, file.folder)
+    stars = moved(bench_stars(file.config, file.folder, sources.moving), sources.moving)
+    stars = seen_in(view, stars, sources.moving)
+    light = light_of(canvas, sky_layers(canvas, Sources(sources.moving)), stars, view)
+    return brightest_in_view(light, stars, canvas.camera, view.q_icrs_to_cam, count)

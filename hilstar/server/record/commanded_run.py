@@ -1,0 +1,60 @@
+"""The attitudes that a run commanded, read from its ledger."""
+
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_S
+from hilstar.server.record.commanded import Commanded
+from hilstar.server.record.ledger_records import NO_FRAMES, frame_records
+
+NOT_SHOWN = (np.nan,) * 4
+
+
+@dataclass(frozen=True, slots=True)
+class CommandedRun:
+    """A run's commanded attitudes by the moment of light, in seconds after `zero_ns` of the
+    sender's clock.
+
+    `changed` counts the frames that the operator's keys or a hidden window changed: these show no
+    commanded attitude. `missed` counts the refresh periods without a frame of their own.
+    """
+
+    commanded: Commanded
+    zero_ns: int
+    changed: int
+    missed: int = 0
+
+    def seconds(self, t_ns: IntArray) -> FloatArray:
+        """Times (n,) of the sender's clock, ns, as the run's seconds."""
+        return np.asarray((t_ns - self.zero_ns) / NS_PER_S)
+
+
+def read_commanded(ledger: Path) -> CommandedRun:
+    """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage,
+    for under two frames.
+    """
+    light, shown, changed, missed = array("q"), array("d"), 0, array("q")
+    for record in frame_records(ledger):
+        plain = record.q is not None and not record.operator and not record.hidden
+        changed += record.q is not None and not plain
+        light.append(record.light_ns)
+        missed.append(record.missed_before)
+        shown.extend(record.q if plain and record.q is not None else NOT_SHOWN)
+    # Of frames of one moment the last counts.
+    light_ns, last = np.unique(np.array(light, dtype=np.int64)[::-1], return_index=True)
+    if len(light_ns) < 2:
+        raise InputError(
+            f"{ledger}:"
+            f" {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}"
+        )
+    q = np.array(shown).reshape(-1, 4)[::-1][last]
+    t_s = (light_ns - light_ns[0]) / NS_PER_S
+    missed_before = np.array(missed, dtype=np.int64)[::-1][last]
+    late = np.flatnonzero(missed_before[1:] > 0) + 1
+    held_s = np.stack([t_s[late - 1], t_s[late]], axis=1)
+    return CommandedRun(Commanded(t_s, q, held_s), int(light_ns[0]), changed, int(sum(missed)))

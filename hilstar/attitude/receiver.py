@@ -78,7 +78,8 @@ class BackChannel:
     def __init__(
         self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns
     ) -> None:
-        self._link, self._now_ns = link, now_ns
+        self._link = link
+        self._now_ns = now_ns
         self._send: Callable[[wire.Packet], None] = link.send
         self._traffic = traffic
         self._posting = threading.Lock()
@@ -123,7 +124,8 @@ class BackChannel:
             self._send(self._answers.popleft())
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
             with self._posting:
-                status, self._status = self._status, None
+                status = self._status
+                self._status = None
             period_ns = round(NS_PER_S / self._traffic.status_hz)
             due_ns = self._next_status_ns + period_ns
             # never two at once, after a pause either
@@ -132,7 +134,8 @@ class BackChannel:
 
     def ask_quickly(self, now_ns: int) -> None:
         """Begin again with quick time requests: now there is a sender to answer."""
-        self._quick_asks, self._next_ask_ns = FIRST_ASKS, now_ns
+        self._quick_asks = FIRST_ASKS
+        self._next_ask_ns = now_ns
 
     def follow(self, arrival: SampleArrival) -> None:
         """This attitude is shown: statuses and time requests go to its sender."""
@@ -151,7 +154,8 @@ class BackChannel:
         request = self._asked.pop(reply.sequence, None)
         if request is None or request.t1_ns != reply.t1_ns:
             return None
-        there_ns, back_ns = self._link.wire_ns(request), self._link.wire_ns(reply)
+        there_ns = self._link.wire_ns(request)
+        back_ns = self._link.wire_ns(reply)
         return Exchange(
             request.t1_ns,
             reply.t2_ns + correction_ns,
@@ -229,7 +233,10 @@ class Receiver:
             self.clock = SenderClock()
             self.jumps: JumpFilter | KnownClockFilter = JumpFilter(self.clock, self._state)
         else:
-            known = SAME_CLOCK if self._unix_offset is None else self._unix_offset()
+            if self._unix_offset is None:
+                known = SAME_CLOCK
+            else:
+                known = self._unix_offset()
             self.clock = SenderClock(known, traffic.clock)
             self.jumps = KnownClockFilter(self._notices, self.clock)
         self.latency_ms = RunningStatistics()
@@ -279,7 +286,8 @@ class Receiver:
                 "receiver-failed", f"the attitude receiver stopped ({why}); restarting it"
             )
         if now_ns >= self._retry_ns:
-            self._retry_ns, self._failure = 0, ""
+            self._retry_ns = 0
+            self._failure = ""
             self.start()
 
     def close(self) -> None:
@@ -291,13 +299,19 @@ class Receiver:
         """The clock's summary, its offset that of the sender's clock as it is now, after all
         jumps.
         """
-        told = replace(self.clock.summary(), jumps=self.jumps.jumps)
-        if told.offset_ms is not None:
-            told = replace(told, offset_ms=told.offset_ms + self.jumps.correction_ns / NS_PER_MS)
-        if self.jumps.slowness > 0 and told.mode == "one-way" and told.uncertainty_ms is not None:
+        summary = replace(self.clock.summary(), jumps=self.jumps.jumps)
+        if summary.offset_ms is not None:
+            summary = replace(
+                summary, offset_ms=summary.offset_ms + self.jumps.correction_ns / NS_PER_MS
+            )
+        if (
+            self.jumps.slowness > 0
+            and summary.mode == "one-way"
+            and summary.uncertainty_ms is not None
+        ):
             behind_ms = 2 * MIN_LIMIT_NS / NS_PER_MS  # one step, and the way to the next
-            told = replace(told, uncertainty_ms=told.uncertainty_ms + behind_ms)
-        return told
+            summary = replace(summary, uncertainty_ms=summary.uncertainty_ms + behind_ms)
+        return summary
 
     def _run(self) -> None:
         try:
@@ -342,7 +356,10 @@ class Receiver:
             # The newest of those that arrived while this thread slept woke it; the others had to
             # wait.
             timely = not waits and k == len(arrivals) - 1
-            waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
+            if timely:
+                waited_ns = 0
+            else:
+                waited_ns = arrival.host_ns - self._empty_ns
             self._take(arrival, arrival.waited_ns if self._link.stamped else waited_ns)
         now_ns = self._now_ns()
         self._state.busy = bool(arrivals)
@@ -350,7 +367,8 @@ class Receiver:
         self._tell_clock()
         if now_ns - self._lost_look_ns >= NS_PER_S:
             self._settle_losses(min(self._lost_before, self.counts.lost))
-            self._lost_before, self._lost_look_ns = self.counts.lost, now_ns
+            self._lost_before = self.counts.lost
+            self._lost_look_ns = now_ns
         if self._link.two_way:
             self.back.talk(now_ns, ask=self._learn_from_ns is not None)
 
@@ -413,7 +431,8 @@ class Receiver:
 
     def _settle(self, arrival: SampleArrival) -> None:
         """Show a sample that has passed all stages, or count it as refused."""
-        sample, host_ns = arrival.event, arrival.host_ns
+        sample = arrival.event
+        host_ns = arrival.host_ns
         refusal = arrival.refusal or self._timeline.add(self._rates.believed(sample), host_ns)
         if refusal is not None:
             self._refuse(arrival, refusal)
@@ -453,5 +472,8 @@ class Receiver:
                 " counted"
             )
             self._notices.mention("refused", line)
-        sample = arrival.event if isinstance(arrival.event, wire.AttitudeSample) else None
+        if isinstance(arrival.event, wire.AttitudeSample):
+            sample = arrival.event
+        else:
+            sample = None
         self._watch(arrival.host_ns, arrival.raw, sample, refusal)

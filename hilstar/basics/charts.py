@@ -146,7 +146,10 @@ def panels_of(
     from matplotlib.figure import Figure
 
     with rc_context({**STYLE, "axes.prop_cycle": cycler(color=SERIES)}):
-        high = MARGIN_INCH + PANEL_INCH * rows if height_inch is None else height_inch
+        if height_inch is None:
+            high = MARGIN_INCH + PANEL_INCH * rows
+        else:
+            high = height_inch
         figure = Figure(figsize=(WIDTH_INCH, high), layout="constrained")
         figure.get_layout_engine().set(h_pad=0.07)  # type: ignore[call-arg,union-attr]
         grid = figure.subplots(
@@ -167,14 +170,16 @@ def finish(figure: "Figure") -> None:
     """
     from matplotlib.ticker import LogLocator
 
-    panels, side_names = figure.axes, _SIDE_NAMES.pop(figure, [])
+    panels = figure.axes
+    side_names = _SIDE_NAMES.pop(figure, [])
     for axes in panels:
         axes.set_title(capital(axes.get_title(loc="left")))
     every: list[Any] = [axis for axes in panels for axis in (axes.xaxis, axes.yaxis)]
     for axis in every:
         axis.set_label_text(capital(axis.get_label_text()))
     log_axes = [axis for axis in every if isinstance(axis.get_major_locator(), LogLocator)]
-    engine, texts = figure.get_layout_engine(), list["Annotation"]()
+    engine = figure.get_layout_engine()
+    texts = list["Annotation"]()
 
     def place() -> tuple[list[object], ...]:
         """Ticks and names at the panels' present size: what of them takes room beside the
@@ -201,7 +206,9 @@ def finish(figure: "Figure") -> None:
 
 def capital(text: str) -> str:
     """A text with a capital first, unless it begins with a symbol of one letter (x, y)."""
-    return text[:1].upper() + text[1:] if re.match(r"\w\w|a ", text) else text
+    if re.match(r"\w\w|a ", text):
+        return text[:1].upper() + text[1:]
+    return text
 
 
 def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:
@@ -243,7 +250,9 @@ def plain(value: float) -> str:
 
 def two_digits(value: float) -> str:
     """A measured figure as a chart says it."""
-    return plain(float(f"{value:.2g}")) if math.isfinite(value) else "-"
+    if math.isfinite(value):
+        return plain(float(f"{value:.2g}"))
+    return "-"
 
 
 def log_ticks(axis: "Axis", room: float) -> None:
@@ -251,7 +260,8 @@ def log_ticks(axis: "Axis", room: float) -> None:
     room for `room`.
     """
     low, high = sorted(axis.get_view_interval())
-    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    first = math.floor(math.log10(low))
+    last = math.ceil(math.log10(high))
     within_decades: tuple[tuple[float, ...], ...] = (
         (1, 1.5, 2, 3, 4, 5, 7),
         (1, 2, 3, 5),
@@ -262,12 +272,11 @@ def log_ticks(axis: "Axis", room: float) -> None:
         *((steps, 1) for steps in within_decades),
         *(((1.0,), every) for every in range(1, 20)),
     ]:
-        ticks = [
-            step * 10.0**power
-            for power in range(first, last + 1)
-            if power % every == 0
-            for step in steps
-        ]
+        ticks = []
+        for power in range(first, last + 1):
+            if power % every == 0:
+                for step in steps:
+                    ticks.append(step * 10.0**power)
         ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
         if min((b / a for a, b in itertools.pairwise(ticks)), default=high) > (high / low) ** (
             1 / room
@@ -319,7 +328,7 @@ def _name_at_side(axes: "Axes", named: SideNames) -> "list[Annotation]":
     }
     falling = sorted(at, key=lambda each: -at[each][1])
     for each, height in zip(
-        falling, spread([float(at[one][1]) for one in falling], gap), strict=True
+        falling, spread([float(at[curve][1]) for curve in falling], gap), strict=True
     ):
         name, place, colour = each
         far = abs(height - at[each][1]) > gap / 3 or at[each][0] < 0.93
@@ -385,7 +394,10 @@ def save(figure: "Figure", path: Path) -> None:
         if path.suffix in ENDINGS
         else [path.with_name(path.name + ending) for ending in ENDINGS]
     ):
-        data = svg(figure).encode() if target.suffix == ".svg" else png(figure)
+        if target.suffix == ".svg":
+            data = svg(figure).encode()
+        else:
+            data = png(figure)
         write_whole(target, data)
 
 

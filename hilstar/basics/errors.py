@@ -83,13 +83,15 @@ def _escape(character: str) -> str:
     code = ord(character)
     if 0xDC80 <= code <= 0xDCFF:  # a byte of a name that is not UTF-8
         code -= 0xDC00
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+    if code < 0x100:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}"
 
 
 def one_line(text: str) -> str:
     """A message as one line of bounded length, whatever it quotes of the input."""
-    words = (shortened(printable(word)) for word in text.split())
-    return shortened(" ".join(words), MAX_LINE_CHARACTERS)
+    short_words = (shortened(printable(word)) for word in text.split())
+    return shortened(" ".join(short_words), MAX_LINE_CHARACTERS)
 
 
 def did_you_mean(word: object, known: Iterable[str]) -> str:
@@ -98,9 +100,11 @@ def did_you_mean(word: object, known: Iterable[str]) -> str:
     """
     import difflib  # 5 ms, which a command without a mistake does not need
 
-    by_small_letters = {one.casefold(): one for one in known}
+    by_small_letters = {name.casefold(): name for name in known}
     near = difflib.get_close_matches(shortened(word).casefold(), by_small_letters, n=1)
-    return f"did you mean {by_small_letters[near[0]]}? " if near else ""
+    if near:
+        return f"did you mean {by_small_letters[near[0]]}? "
+    return ""
 
 
 def size_text(size_bytes: int) -> str:

@@ -102,7 +102,9 @@ def place_of(path: Path) -> Place | None:
         status = path.stat()
     except (OSError, ValueError):
         return os.path.realpath(path)
-    return (status.st_dev, status.st_ino) if stat.S_ISREG(status.st_mode) else None
+    if stat.S_ISREG(status.st_mode):
+        return (status.st_dev, status.st_ino)
+    return None
 
 
 def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None]) -> None:
@@ -125,7 +127,10 @@ def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None])
         if place is None:
             continue
         if place in taken:
-            other = "" if taken[place] == path else f", the same file as {taken[place]}"
+            if taken[place] == path:
+                other = ""
+            else:
+                other = f", the same file as {taken[place]}"
             raise InputError(
                 f"{path}{other}: is read or written by this command already; write another name for"
                 " the output"
@@ -139,17 +144,21 @@ def files_named_in(path: Path, text: str | None = None, depth: int = 0) -> list[
 
     Nothing is refused here.
     """
-    found = [path]
+    paths = [path]
     try:
-        text = read_text(path, "", MAX_TOML_BYTES) if text is None else text
-        table = parse_toml(path, text) if depth < MAX_DEPTH else {}
+        if text is None:
+            text = read_text(path, "", MAX_TOML_BYTES)
+        if depth < MAX_DEPTH:
+            table = parse_toml(path, text)
+        else:
+            table = {}
     except InputError:
-        return found
+        return paths
     for text in _texts(table):
         named = path.parent / text
         if len(text) < 4096 and "\0" not in text and exists(named) and named.is_file():
-            found += files_named_in(named, depth=depth + 1) if named.suffix == ".toml" else [named]
-    return found
+            paths += files_named_in(named, depth=depth + 1) if named.suffix == ".toml" else [named]
+    return paths
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -289,7 +298,9 @@ class NewFile:
         made = path
         if exists(path):
             made = self._part = _part_path(Path(os.path.realpath(path)))
-        self._mtime_ns, self._look_s, self._rest_s = 0, 0.0, MIN_REST_S
+        self._mtime_ns = 0
+        self._look_s = 0.0
+        self._rest_s = MIN_REST_S
         try:
             # Written by append: what somebody cuts off is missing for good, and the size says so.
             # Read to be compared.
@@ -322,7 +333,9 @@ class NewFile:
         if not status.st_nlink:
             return "deleted"
         if status.st_size != size_bytes:
-            return "truncated" if status.st_size < size_bytes else "overwritten"
+            if status.st_size < size_bytes:
+                return "truncated"
+            return "overwritten"
         if status.st_mtime_ns == self._mtime_ns or time.monotonic() < self._look_s:
             return None
         if _crc_of(self.fd, size_bytes) != crc:
@@ -351,7 +364,8 @@ def _crc_of(fd: int, size_bytes: int) -> int:
     while place < size_bytes and (
         data := os.pread(fd, min(CHUNK_BYTES, size_bytes - place), place)
     ):
-        crc, place = zlib.crc32(data, crc), place + len(data)
+        crc = zlib.crc32(data, crc)
+        place = place + len(data)
     return crc
 
 

@@ -244,7 +244,9 @@ def _unit_of_comment(comment: str) -> float:
         if unit_s is not None:
             return unit_s
     plain = PLAIN_UNITS.search(comment)
-    return 1.0 if plain is None else SECONDS_OF_UNIT[plain[1].lower().replace("-", "")]
+    if plain is None:
+        return 1.0
+    return SECONDS_OF_UNIT[plain[1].lower().replace("-", "")]
 
 
 def _middle_ns(header: Any, exposure_s: float | None, notes: list[str]) -> int | None:
@@ -355,10 +357,14 @@ def _date_time(key: str, header: Any, notes: list[str]) -> tuple[int | None, flo
         notes.append(f"{key} = {shortened(text)} {NO_DATE}")
         return None, None
     if old is not None:
-        date, time, zone = f"19{old[3]}-{old[2]}-{old[1]}", None, None
+        date = f"19{old[3]}-{old[2]}-{old[1]}"
+        time = None
+        zone = None
     else:
         assert match is not None
-        date, time, zone = match[1], match[2], match[3]
+        date = match[1]
+        time = match[2]
+        zone = match[3]
     if time is None:
         time = _time_beside(key, header)
     if time is None:
@@ -470,7 +476,10 @@ def _pattern_elsewhere(header: Any, notes: list[str]) -> str:
 def _pattern(key: str, value: Any) -> str:
     text = re.sub(r"[^A-Z0-9/]", "", str(value).upper())
     maker = MAKERS_PATTERN.fullmatch(text.replace("/", ""))
-    letters = "" if maker is None else SHORT_PATTERNS.get(maker[1], maker[1])
+    if maker is None:
+        letters = ""
+    else:
+        letters = SHORT_PATTERNS.get(maker[1], maker[1])
     if letters in PATTERNS:
         return letters
     if text not in NO_PATTERN:

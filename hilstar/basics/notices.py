@@ -88,12 +88,12 @@ class _Kind:
             self.quiet_s = 0.0
         self.said_ns.append(now_ns)
         often = len(self.said_ns) == MAX_SAID and now_ns - self.said_ns[0] < SAID_WINDOW_S * 1e9
-        said = notice.detail + (f" ({meanwhile} more meanwhile)" if meanwhile else "")
+        text = notice.detail + (f" ({meanwhile} more meanwhile)" if meanwhile else "")
         if not often and not (self.quiet_s and not rare):
-            return said
+            return text
         self.quiet_s = min(max(2 * self.quiet_s, SAID_WINDOW_S), MAX_QUIET_S)
         self.until_ns = now_ns + round(self.quiet_s * 1e9)
-        return f"{said}; further ones are only counted for {self.quiet_s:.0f} s"
+        return f"{text}; further ones are only counted for {self.quiet_s:.0f} s"
 
 
 class Notices:
@@ -126,16 +126,16 @@ class Notices:
             self._counts[kind] += 1
             known = self._kinds.setdefault(kind, _Kind(deque(maxlen=MAX_SAID)))
             known.detail = notice.detail
-            words = known.words(notice)
+            text = known.words(notice)
             recorded = (
-                words is not None
+                text is not None
                 or known.recorded < MAX_RECORDED
                 or bool(who)
                 or kind in ALWAYS_RECORDED
             )
             known.recorded += recorded
-        if words is not None:
-            log.warning("%s", at_now(words))
+        if text is not None:
+            log.warning("%s", at_now(text))
         if recorded:
             self._hand_on(notice)
 
@@ -146,11 +146,11 @@ class Notices:
             for known in self._kinds.values():
                 known.unsaid = 0
         if unsaid:
-            told = ", ".join(
+            kind_counts = ", ".join(
                 f"{kind} {self._counts[kind]} ({count} of them not said)"
                 for kind, count in unsaid.items()
             )
-            log.warning("%s", at_now(f"events in all: {told}"))
+            log.warning("%s", at_now(f"events in all: {kind_counts}"))
 
     def _hand_on(self, notice: Notice) -> None:
         for listener in self._listeners:
@@ -195,7 +195,9 @@ class Notices:
     def latest(self, kind: str) -> str:
         """What was told last of a kind; "" for one that never came."""
         with self._lock:
-            return self._kinds[kind].detail if kind in self._kinds else ""
+            if kind in self._kinds:
+                return self._kinds[kind].detail
+            return ""
 
     def counts(self) -> dict[str, int]:
         """How often each kind came."""

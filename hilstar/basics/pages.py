@@ -156,7 +156,8 @@ def page_of(title: str, verdict: Verdict, parts: Iterable[str], script: str = ""
 
 def page_style() -> str:
     """The style sheet of a page: the palette by the reader's theme, light on paper."""
-    light, dark = declarations("light"), declarations("dark")
+    light = declarations("light")
+    dark = declarations("dark")
     return (
         f":root {{ color-scheme: light dark; {SHAPE} {light} }}\n"
         f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
@@ -226,7 +227,7 @@ def within(value: float, low: float, high: float, unit: str = "") -> str:
     if not math.isfinite(half) or half <= 0:
         return f"{value:.4g} {unit}".rstrip()
     digits = 1 - math.floor(math.log10(half))
-    shown, first, last = (_rounded(each, digits) for each in (value, low, high))
+    shown, first, last = (_rounded(figure, digits) for figure in (value, low, high))
     return f"{shown} ({first} to {last}) {unit}".rstrip()
 
 
@@ -243,10 +244,10 @@ def table_of(
     None is an empty cell, and numbers stand at the right.
     """
     table = [list(row) for row in rows]
-    kept = range(max((len(row) for row in table), default=0))
+    columns = range(max((len(row) for row in table), default=0))
     if header:
-        kept = range(len(header))
-    shown = [column for column in kept if not header or _has_values(table, column)]
+        columns = range(len(header))
+    shown = [column for column in columns if not header or _has_values(table, column)]
     lines = []
     if header:
         cells = "".join(f'<th scope="col">{escaped(header[column])}</th>' for column in shown)

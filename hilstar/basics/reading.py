@@ -273,13 +273,15 @@ def warn_once(line: str) -> None:
 
 
 def _not_text(file: IO[bytes]) -> str:
-    decoder, offset = codecs.getincrementaldecoder("utf-8")(), 0
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    offset = 0
     while chunk := file.read(CHUNK_BYTES):
         waiting = len(decoder.getstate()[0])
         try:
             decoder.decode(chunk)
         except UnicodeDecodeError as error:
-            place, byte = offset - waiting + error.start, error.object[error.start]
+            place = offset - waiting + error.start
+            byte = error.object[error.start]
             return f"it is not UTF-8: byte {place} is 0x{byte:02x}"
         offset += len(chunk)
     return f"it is not UTF-8: it ends within a character, at byte {offset}"
@@ -305,7 +307,9 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
 
 def _refuse_other(path: Path, mode: int, advice: str) -> None:
     if not stat.S_ISREG(mode):
-        what = next((words for test, words in NOT_FILES.items() if test(mode)), "is no file")
+        what = next(
+            (kind_text for test, kind_text in NOT_FILES.items() if test(mode)), "is no file"
+        )
         raise cannot_read(path, f"it {what}", advice)
 
 

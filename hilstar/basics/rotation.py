@@ -27,7 +27,8 @@ def conjugate(q: FloatArray) -> FloatArray:
 
 def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """Hamilton product a b: first the rotation b, then a."""
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    a = np.asarray(a, dtype=np.float64)
+    b = np.asarray(b, dtype=np.float64)
     # then Python's floats give the same bits, several times faster than arrays
     single = a.ndim == b.ndim == 1
     aw, ax, ay, az = a.tolist() if single else np.moveaxis(a, -1, 0)
@@ -38,7 +39,9 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
         aw * by - ax * bz + ay * bw + az * bx,
         aw * bz + ax * by - ay * bx + az * bw,
     )
-    return np.array(product) if single else np.stack(product, axis=-1)
+    if single:
+        return np.array(product)
+    return np.stack(product, axis=-1)
 
 
 def to_matrix(q: FloatArray) -> FloatArray:
@@ -54,7 +57,9 @@ def to_matrix(q: FloatArray) -> FloatArray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return matrix if q.ndim == 1 else np.ascontiguousarray(np.moveaxis(matrix, (0, 1), (-2, -1)))
+    if q.ndim == 1:
+        return matrix
+    return np.ascontiguousarray(np.moveaxis(matrix, (0, 1), (-2, -1)))
 
 
 def from_rotation_vector(vector_rad: FloatArray) -> FloatArray:
@@ -111,7 +116,8 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
     if k == 0:
         q = np.array([1 + trace, *skew])
     else:
-        i, both = k - 1, matrix + matrix.T
+        i = k - 1
+        both = matrix + matrix.T
         q = np.array([skew[i], *both[i]])
         q[k] = 1 - trace + 2 * matrix[i, i]
     q = normalise(q)
@@ -122,7 +128,8 @@ def direction_of(ra_deg: ArrayLike, dec_deg: ArrayLike) -> FloatArray:
     """The unit vectors (..., 3) of right ascensions and declinations, degrees, in the axes that
     these are of.
     """
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    ra = np.radians(ra_deg)
+    dec = np.radians(dec_deg)
     return np.stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)), axis=-1)
 
 
@@ -185,7 +192,10 @@ def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: fl
     """
     vector = -0.5 * seconds * np.asarray(rate_cam_rad_s, dtype=np.float64)
     half = float(np.linalg.norm(vector))
-    sinc = 1.0 - half * half / 6.0 if half < SMALL_RAD else np.sin(half) / half
+    if half < SMALL_RAD:
+        sinc = 1.0 - half * half / 6.0
+    else:
+        sinc = np.sin(half) / half
     step = np.array([np.cos(half), *(sinc * vector)])
     return normalise(multiply(step, q_icrs_to_cam))
 
@@ -199,7 +209,10 @@ def rate_between_rad_s(earlier: FloatArray, later: FloatArray, seconds: float) -
         d = -d
     sine = float(np.linalg.norm(d[1:]))
     half = np.arctan2(sine, d[0])
-    scale = 1.0 + half * half / 6.0 if half < SMALL_RAD else half / sine
+    if half < SMALL_RAD:
+        scale = 1.0 + half * half / 6.0
+    else:
+        scale = half / sine
     return np.asarray(-2.0 * scale * d[1:] / seconds)
 
 

@@ -36,7 +36,8 @@ class RunningStatistics:
 
     def __init__(self) -> None:
         self._counts = np.zeros(2 * BINS + 1, dtype=np.int64)
-        self.count, self.max = 0, -math.inf
+        self.count = 0
+        self.max = -math.inf
         self._mean = self._squares = 0.0
 
     def add(self, value: float) -> None:
@@ -47,14 +48,18 @@ class RunningStatistics:
         self._mean += step / self.count
         self._squares += step * (value - self._mean)  # Welford 1962
         size = abs(value)
-        place = 0 if size < MIN_SIZE else min(BINS, 1 + int(math.log(size / MIN_SIZE) / STEP))
+        if size < MIN_SIZE:
+            place = 0
+        else:
+            place = min(BINS, 1 + int(math.log(size / MIN_SIZE) / STEP))
         self._counts[BINS + place if value >= 0 else BINS - place] += 1
 
     def add_all(self, values: FloatArray) -> None:
         """Count values (n,)."""
         if not len(values):
             return
-        count, step = self.count + len(values), float(values.mean()) - self._mean
+        count = self.count + len(values)
+        step = float(values.mean()) - self._mean
         # Chan 1979
         self._squares += (
             float(((values - values.mean()) ** 2).sum())
@@ -78,7 +83,9 @@ class RunningStatistics:
     @property
     def deviation(self) -> float | None:
         """The standard deviation; None for fewer than two values."""
-        return math.sqrt(self._squares / self.count) if self.count > 1 else None
+        if self.count > 1:
+            return math.sqrt(self._squares / self.count)
+        return None
 
     def percentile(self, percent: float) -> float | None:
         """The value at `percent` of the sorted values, within 0.1 %; None without a value."""
@@ -86,7 +93,10 @@ class RunningStatistics:
             return None
         rank = max(1, math.ceil(percent / 100 * self.count))
         place = int(np.searchsorted(np.cumsum(self._counts), rank)) - BINS
-        size = 0.0 if place == 0 else MIN_SIZE * math.exp((abs(place) - 0.5) * STEP)
+        if place == 0:
+            size = 0.0
+        else:
+            size = MIN_SIZE * math.exp((abs(place) - 0.5) * STEP)
         return min(math.copysign(size, place), self.max)
 
     def percentiles(self) -> Percentiles:

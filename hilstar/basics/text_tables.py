@@ -218,7 +218,9 @@ class TextTable:
         No quoted cell goes over the end of a piece. For a parser of whole columns; a doubtful end
         is warned of.
         """
-        number, size, quotes = self.first_row, 0, 0
+        number = self.first_row
+        size = 0
+        quotes = 0
         lines: list[str] = []
         for line in self._watched():
             lines.append(line)
@@ -227,7 +229,10 @@ class TextTable:
             if size < characters or (quotes % 2 and size < 2 * characters):
                 continue
             yield number, lines
-            number, size, quotes, lines = number + len(lines), 0, 0, []
+            number = number + len(lines)
+            size = 0
+            quotes = 0
+            lines = []
         if not lines:
             return
         if self._unended and not self._is_whole(split(lines[-1], self.delimiter), []):
@@ -308,8 +313,12 @@ class TextTable:
         if exact:
             return self._named(self._only(name, exact), by_name, wanted)
         bases = (base, *OTHER_NAMES.get(base, ()), *other_names)
-        united, plain = self._united(bases, wanted), self._places(bases)
-        dated = self._dated() if base == "t" and not united else []
+        united = self._united(bases, wanted)
+        plain = self._places(bases)
+        if base == "t" and not united:
+            dated = self._dated()
+        else:
+            dated = []
         if dated:
             return self._of_dates(self._only(name, dated))
         # Where a unit has to be stated, one that states none is another quantity.
@@ -355,7 +364,9 @@ class TextTable:
         if places:
             return Chosen(self._only(VALID, places))
         places = self._about(False)
-        return Chosen(self._only("invalid", places), inverted=True) if places else None
+        if places:
+            return Chosen(self._only("invalid", places), inverted=True)
+        return None
 
     def _places(self, names: Sequence[str]) -> list[int]:
         places = []
@@ -416,7 +427,10 @@ class TextTable:
     def _only(self, name: str, places: Sequence[int]) -> int:
         if len(places) > 1:
             headers = {self.columns[place].header for place in places}
-            also = "" if headers == {name} else f" ({', '.join(sorted(headers))})"
+            if headers == {name}:
+                also = ""
+            else:
+                also = f" ({', '.join(sorted(headers))})"
             raise self.refusal(self.header_line, f"column {name} is there twice{also}")
         return places[0]
 
@@ -516,7 +530,9 @@ def seconds_of_date(text: str) -> str:
     seconds = (day - EPOCH_DAY).days * 86400 + clock.hour * 3600
     seconds += clock.minute * 60 + clock.second - _ahead_s(match["zone"] or "Z")
     whole = Decimal(seconds)
-    return str(whole + Decimal(match["fraction"] or 0)) if match["fraction"] != "." else str(whole)
+    if match["fraction"] != ".":
+        return str(whole + Decimal(match["fraction"] or 0))
+    return str(whole)
 
 
 def _ahead_s(zone: str) -> int:
@@ -583,7 +599,8 @@ def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
     """
     comments, sample, number, delimiter = _head(path, advice, lines)
     title = _title_lines(sample)
-    number, sample = number + title, sample[title:]
+    number = number + title
+    sample = sample[title:]
     following = itertools.chain(sample, lines)
     if not sample:
         return TextTable(path, advice, [], ",", number, following, header=False)
@@ -591,7 +608,10 @@ def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
     header = split(sample[0], delimiter)
     table = TextTable(path, advice, [], delimiter, number, following, header_line=number)
     if title:
-        above = "line above the header is" if title == 1 else f"{title} lines above the header are"
+        if title == 1:
+            above = "line above the header is"
+        else:
+            above = f"{title} lines above the header are"
         table.notices.append(f"the {above} taken for a title")
     if len(sample[0]) > MAX_HEADER_CHARACTERS:
         reason = f"its first line is longer than {MAX_HEADER_CHARACTERS} characters"
@@ -715,7 +735,8 @@ def delimiter_of(lines: Sequence[str]) -> str:
     """What stands between the cells of a table's first lines, a header or a row before the
     others.
     """
-    best, best_rank = ",", (0, 0.0, 0)
+    best = ","
+    best_rank = (0, 0.0, 0)
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
     for delimiter in DELIMITERS:
         cells = [split(line, delimiter) for line in rows]
@@ -727,7 +748,8 @@ def delimiter_of(lines: Sequence[str]) -> str:
         numbers = sum(map(is_number, filled))
         rank = (len(alike), numbers / max(len(filled), 1), count)
         if rank > best_rank:
-            best, best_rank = delimiter, rank
+            best = delimiter
+            best_rank = rank
     return best
 
 
@@ -737,7 +759,10 @@ def _name_by_comment(table: TextTable, comments: Sequence[str], count: int) -> N
     """
     table.header = False
     table.columns = [Column("", "")] * count
-    text = comments[-1].strip().lstrip('#%!;/"').strip() if comments else ""
+    if comments:
+        text = comments[-1].strip().lstrip('#%!;/"').strip()
+    else:
+        text = ""
     for delimiter in dict.fromkeys((table.delimiter, ",", " ")):
         names = split(text, delimiter) if text else []
         if len(names) == count and not any(map(is_number, names)):
@@ -834,7 +859,10 @@ def needed(table: TextTable, name: str, unit: str = "") -> Chosen:
     """The column of that name. Raises InputError where there is none."""
     chosen = table.chosen(name, unit)
     if chosen is None:
-        there = f" (its columns are {table.names})" if table.header and table.columns else ""
+        if table.header and table.columns:
+            there = f" (its columns are {table.names})"
+        else:
+            there = ""
         raise table.refusal(table.header_line, f"column {name} is missing{there}")
     return chosen
 

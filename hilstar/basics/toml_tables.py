@@ -47,7 +47,9 @@ def explained(message: str, tables: dict[str, Any], kind: Kind) -> str:
 
 def plain(hint: Any) -> Any:
     """A key's type without its limits and meaning."""
-    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    if get_origin(hint) is Annotated:
+        return get_args(hint)[0]
+    return hint
 
 
 def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
@@ -61,7 +63,10 @@ def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
         return f"{_place(names)}unknown key {shortened(unknown[1])}; {advice}"
     missing = re.search(r"missing required field `(.*)`", fault)
     if missing:
-        name = f"key {missing[1]}" if names else f"table [{missing[1]}]"
+        if names:
+            name = f"key {missing[1]}"
+        else:
+            name = f"table [{missing[1]}]"
         return f"{_place(names)}the {name} is missing; add it (see {kind.reference})"
     *table, key = [name for name in names if not name.isdigit()]
     value: Any = tables
@@ -102,10 +107,15 @@ def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
         return ""
     kinds = [plain(kind) for kind in get_args(parts)]
     if Ellipsis in kinds:
-        return f", such as {field.name} = [{_toml(value)}]" if isinstance(value, kinds[0]) else ""
+        if isinstance(value, kinds[0]):
+            return f", such as {field.name} = [{_toml(value)}]"
+        return ""
     if isinstance(value, int | float) and not isinstance(value, bool) and len(kinds) == 2:
         return f", such as {field.name} = [{_toml(value)}, {_toml(value)}]"
-    example = field.default if isinstance(field.default, tuple) else EXAMPLES[len(kinds)]
+    if isinstance(field.default, tuple):
+        example = field.default
+    else:
+        example = EXAMPLES[len(kinds)]
     return f", such as {field.name} = {_toml(list(example)).replace(',', ', ')}"
 
 
@@ -148,7 +158,10 @@ def _choices(kind: Any) -> tuple[Any, ...]:
     """The values of a key that has choices, those of X where it is `X | None`; none of another
     key.
     """
-    parts = get_args(kind) if type(None) in get_args(kind) else (kind,)
+    if type(None) in get_args(kind):
+        parts = get_args(kind)
+    else:
+        parts = (kind,)
     literal = [plain(part) for part in parts if get_origin(plain(part)) is Literal]
     return tuple(choice for part in literal for choice in get_args(part))
 

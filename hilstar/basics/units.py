@@ -140,7 +140,9 @@ def magnitude(ratio: "float | FloatArray") -> "float | FloatArray":
 
         with np.errstate(divide="ignore"):
             return np.asarray(-2.5 * np.log10(ratio))
-    return -2.5 * math.log10(ratio) if ratio > 0 else math.inf
+    if ratio > 0:
+        return -2.5 * math.log10(ratio)
+    return math.inf
 
 
 @cache
@@ -183,7 +185,9 @@ def plain_unit(text: str) -> str:
 def suffix_unit(suffix: str) -> str:
     """A unit as it ends a name: "arcsec_yr" is arcsec/yr, "deg_s" deg/s."""
     plain = plain_unit(suffix)
-    return plain if is_unit(plain) else plain.replace("_", "/")
+    if is_unit(plain):
+        return plain
+    return plain.replace("_", "/")
 
 
 def is_unit(plain: str) -> bool:
@@ -195,7 +199,8 @@ def factor(unit: str, wanted: str) -> Decimal | None:
     """By what figures in `unit` are multiplied to be in `wanted`; None where the two are of
     different kinds.
     """
-    plain, target = plain_unit(unit), plain_unit(wanted)
+    plain = plain_unit(unit)
+    target = plain_unit(wanted)
     if plain == target:
         return Decimal(1)
     for sizes in _sizes():

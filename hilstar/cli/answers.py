@@ -81,26 +81,26 @@ def answers(
     if shown is None and explain and recorded is None:
         shown = _shown_now(file)
     if recorded is None:
-        decoder, found = _live(plan, seconds)
+        decoder, answer_stream = _live(plan, seconds)
     else:
         decoder = plan.decoder(messages=False)
-        found = recorded_answers(plan, decoder, recorded)
+        answer_stream = recorded_answers(plan, decoder, recorded)
     rows: deque[dict[str, Any]] = deque(maxlen=MAX_ROWS)
-    for each in found:
-        if isinstance(each, RefusedAnswer):
-            counts[each.reason] += 1
+    for answer in answer_stream:
+        if isinstance(answer, RefusedAnswer):
+            counts[answer.reason] += 1
             row, line = (
-                {"refused": each.reason, "detail": each.detail},
-                f"refused ({each.reason}): {each.detail}",
+                {"refused": answer.reason, "detail": answer.detail},
+                f"refused ({answer.reason}): {answer.detail}",
             )
         else:
             counts["answers"] += 1
-            counts["valid"] += each.valid
-            row, line = _row(each), _line(each)
+            counts["valid"] += answer.valid
+            row, line = _row(answer), _line(answer)
         if as_json:
-            rows.append(row | {"raw": each.raw.hex()})
+            rows.append(row | {"raw": answer.raw.hex()})
             continue
-        for text in [line, *(lines_of(each, decoder, shown) if explain else ())]:
+        for text in [line, *(lines_of(answer, decoder, shown) if explain else ())]:
             if text:
                 typer.echo(text)
     if as_json:
@@ -131,7 +131,9 @@ def _shown_now(file: "BenchFile") -> "FloatArray | None":
         return None
     try:
         with open_link(file.config, file.folder) as link:
-            return None if link.steps else first_attitude(link, SHOWN_WITHIN_S).q_icrs_to_cam
+            if link.steps:
+                return None
+            return first_attitude(link, SHOWN_WITHIN_S).q_icrs_to_cam
     except InputError:
         say(f"{settings.address}: no attitude comes; give what is shown by --radec RA,DEC,ROLL")
         return None
@@ -153,9 +155,9 @@ def _shown_by_page() -> "FloatArray | None":
     try:
         connection = http.client.HTTPConnection(HOST, PORT, timeout=PAGE_WITHIN_S)
         connection.request("GET", "/state")
-        said = msgspec.json.decode(connection.getresponse().read(MAX_STATE_BYTES))
+        state = msgspec.json.decode(connection.getresponse().read(MAX_STATE_BYTES))
         connection.close()
-        shown = msgspec.convert(said["state"]["attitude"], ShownAttitude)
+        shown = msgspec.convert(state["state"]["attitude"], ShownAttitude)
     except (OSError, http.client.HTTPException, *NOT_JSON, LookupError, TypeError):
         return None  # no run, one without an attitude, or another program
     say(
@@ -175,7 +177,8 @@ def _live(
     from hilstar.server.answers.reader import live_answers
 
     link = plan.open_first(Notices())
-    decoder, stop = plan.decoder(link.messages), threading.Event()
+    decoder = plan.decoder(link.messages)
+    stop = threading.Event()
     say(f"listening at {link.endpoint}; Ctrl-C ends it")
 
     def found() -> "Iterator[Answer | RefusedAnswer]":
@@ -195,12 +198,12 @@ def _row(found: "Answer") -> dict[str, Any]:
 def _line(found: "Answer") -> str:
     from hilstar.basics.rotation import to_radec_roll_deg, turn_text
 
-    words = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]
+    parts = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]
     if found.q_icrs_to_cam is not None:
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(found.q_icrs_to_cam)
-        words.append("q " + " ".join(f"{part:+.7f}" for part in found.q_icrs_to_cam))
-        words.append(f"RA {turn_text(ra_deg)} Dec {dec_deg:+.4f} roll {turn_text(roll_deg)}")
-    words += [] if found.valid else ["not valid"]
-    words += [found.mode] if found.mode else []
-    words += [] if found.star_count is None else [f"{found.star_count} stars"]
-    return ", ".join(words)
+        parts.append("q " + " ".join(f"{part:+.7f}" for part in found.q_icrs_to_cam))
+        parts.append(f"RA {turn_text(ra_deg)} Dec {dec_deg:+.4f} roll {turn_text(roll_deg)}")
+    parts += [] if found.valid else ["not valid"]
+    parts += [found.mode] if found.mode else []
+    parts += [] if found.star_count is None else [f"{found.star_count} stars"]
+    return ", ".join(parts)

@@ -119,9 +119,9 @@ def application(only: str | None = None) -> typer.Typer:
         for name in names:
             if only in (None, public(name)):
                 add(app, name, name, panel)
-    for group, (panel, words, names) in GROUPS.items():
+    for group, (panel, group_help, names) in GROUPS.items():
         if only in (None, group):
-            members = typer.Typer(help=words)
+            members = typer.Typer(help=group_help)
             for name in names:
                 add(members, group, name)
             app.add_typer(members, name=group, rich_help_panel=panel)

@@ -76,17 +76,17 @@ def assess(
     check_files(
         [ledger, *([] if telemetry is None else [telemetry])], [output / name for name in names]
     )
-    found = assess_files(
+    assessment = assess_files(
         ledger, telemetry, AssessSettings(stamp, latency_ms / 1e3, display_attitudes)
     )
     make_directory(output)
-    write_tables(output, found)
-    write_page(output / "budget.html", found)
+    write_tables(output, assessment)
+    write_page(output / "budget.html", assessment)
     rows = [
-        *lines_of(found),
-        *(("note", note) for note in found.notes),
+        *lines_of(assessment),
+        *(("note", note) for note in assessment.notes),
         ("page", output / "budget.html"),
     ]
-    print_found(as_json, budget_of(found), (f"{what:24}{text}" for what, text in rows))
-    for note in found.notes if as_json else ():
+    print_found(as_json, budget_of(assessment), (f"{what:24}{text}" for what, text in rows))
+    for note in assessment.notes if as_json else ():
         say(note)

@@ -66,7 +66,10 @@ def attitude(
 
     live = source.suffix.lower() == ".toml"
     first = read_bench_file(source if live else bench or resource_path("configs", "demo.toml"))
-    file = read_bench_file(bench) if live and bench is not None else first
+    if live and bench is not None:
+        file = read_bench_file(bench)
+    else:
+        file = first
     if live:
         written = "write it into"
         if statements.mounting is not None:
@@ -86,10 +89,10 @@ def attitude(
     else:
         sample, conventions, held = _of_log(source, at, stated)
     file = dated(file, conventions.scale, sample.t_ns)
-    told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
+    fields = {"source": conventions.source, "held": held, **_pointing(sample, file)}
     meaning = conventions.lines(stated.mounting)
     print_found(
-        as_json, told | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(told)]
+        as_json, fields | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(fields)]
     )
 
 
@@ -125,11 +128,11 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
     for _, line in [*log.told, *joins.told]:
         say(line)
     t_ns = time_in_log(path, log.samples, at)
-    found = log_timeline(log.samples, Policy(0, 0), joins).at(t_ns)
-    if found is None:
+    state = log_timeline(log.samples, Policy(0, 0), joins).at(t_ns)
+    if state is None:
         raise AssertionError("a log has samples")
-    held = found.rate_cam_rad_s is None and found.age_ns > 0
-    sample = AttitudeSample(t_ns, found.q_icrs_to_cam, found.rate_cam_rad_s, found.sequence)
+    held = state.rate_cam_rad_s is None and state.age_ns > 0
+    sample = AttitudeSample(t_ns, state.q_icrs_to_cam, state.rate_cam_rad_s, state.sequence)
     return _Found(sample, log.conventions, held)
 
 

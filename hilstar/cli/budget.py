@@ -67,11 +67,12 @@ def budget(
         )
     with load(bench_file) as bench:
         fields = fields_of_view(bench.config, bench.file.folder)
-        found, assumed = find_budget(bench, by), shares_line(bench) or colour_line(bench)
+        star_budget = find_budget(bench, by)
+        assumed = shares_line(bench) or colour_line(bench)
     if output is not None:
-        write_report(make_directory(output), found)
-    print_found(as_json, found, budget_lines(found))
-    say_optics(fields, found.star)
+        write_report(make_directory(output), star_budget)
+    print_found(as_json, star_budget, budget_lines(star_budget))
+    say_optics(fields, star_budget.star)
     if assumed is not None:
         say(assumed)
 
@@ -84,10 +85,13 @@ def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.tracker.centroids import CentroidSettings
 
-    attitude = None if radec is None else parse_attitude("budget", radec, None)
-    found = noise_budget(
+    if radec is None:
+        attitude = None
+    else:
+        attitude = parse_attitude("budget", radec, None)
+    noise = noise_budget(
         read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0)
     )
     if output is not None:
-        write_noise(make_directory(output), found)
-    print_found(as_json, found, noise_lines(found))
+        write_noise(make_directory(output), noise)
+    print_found(as_json, noise, noise_lines(noise))

@@ -85,9 +85,12 @@ def dots(
     check_directory("-o", output)
     file = read_bench_file(bench_file)
     monitor = file.config.monitor
-    seen = seen_screen_of(file)
-    lit = lit_for(seen) if dots_per_frame is None else dots_per_frame
-    plan = plan_seen_dots(seen, frames, lit, np.random.default_rng(seed))
+    seen_screen = seen_screen_of(file)
+    if dots_per_frame is None:
+        lit = lit_for(seen_screen)
+    else:
+        lit = dots_per_frame
+    plan = plan_seen_dots(seen_screen, frames, lit, np.random.default_rng(seed))
     check_files([], [output / "plan.csv"], file)
     make_directory(output)
     write_plan(output / "plan.csv", plan)
@@ -98,15 +101,17 @@ def dots(
     if show:
         shown = show_dots(plan, monitor, seconds, windowed=windowed)
         say(f"{shown} of {plan.frames} frames shown")
-    told = {
+    summary = {
         "frames": plan.frames,
         "dots": len(plan),
         "lit": int(plan.lit.sum()),
         "seed": seed,
         "written": str(output),
     }
-    each = f"{plan.lit.sum() / plan.frames:.0f} lit in each"
-    print_found(as_json, told, [f"{len(plan)} dots in {plan.frames} frames, {each}, in {output}"])
+    lit_text = f"{plan.lit.sum() / plan.frames:.0f} lit in each"
+    print_found(
+        as_json, summary, [f"{len(plan)} dots in {plan.frames} frames, {lit_text}, in {output}"]
+    )
 
 
 def geometric(
@@ -152,14 +157,18 @@ def geometric(
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
     check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
-    found = calibrate_files(
+    calibration = calibrate_files(
         file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
     )
     monitor = file.config.monitor
     written = write_calibrated(
-        output, found, plot, _monitor_of(monitor.display, monitor.resolution_px)
+        output, calibration, plot, _monitor_of(monitor.display, monitor.resolution_px)
     )
-    print_found(as_json, summary_of(found, written), [*lines_of(found), NAMED.format(output.name)])
+    print_found(
+        as_json,
+        summary_of(calibration, written),
+        [*lines_of(calibration), NAMED.format(output.name)],
+    )
 
 
 def psf(
@@ -197,18 +206,20 @@ def psf(
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
     check_files([*images, dark, plan / "plan.csv"], [output, plot], file)
-    found = effective_psf(file, images, plan / "plan.csv", dark, oversampling)
-    write_glass(output, found.glass)
+    psf_result = effective_psf(file, images, plan / "plan.csv", dark, oversampling)
+    write_glass(output, psf_result.glass)
     if plot is not None:
-        draw_effective(plot, found)
-    told = summary_of(found) | {
-        "written": [str(each) for each in (output, plot) if each is not None]
+        draw_effective(plot, psf_result)
+    summary = summary_of(psf_result) | {
+        "written": [
+            str(written_path) for written_path in (output, plot) if written_path is not None
+        ]
     }
     print_found(
         as_json,
-        told,
+        summary,
         [
-            *lines_of(found),
+            *lines_of(psf_result),
             f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}",
         ],
     )
@@ -286,13 +297,13 @@ def alignment(
         )
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
-    found = align_files(file, pairs, ledger, offset_s or 0.0)
+    aligned = align_files(file, pairs, ledger, offset_s or 0.0)
     monitor = file.config.monitor
-    write_alignment(output, found, file, _monitor_of(monitor.display, monitor.resolution_px))
+    write_alignment(output, aligned, file, _monitor_of(monitor.display, monitor.resolution_px))
     print_found(
         as_json,
-        summary_of(found) | {"written": [str(output)]},
-        [*lines_of(found), NAMED.format(output.name)],
+        summary_of(aligned) | {"written": [str(output)]},
+        [*lines_of(aligned), NAMED.format(output.name)],
     )
 
 
@@ -354,8 +365,14 @@ def plan(
     codes = len({patch.code for patch in planned})
     line = f"{len(planned)} patches of {codes} codes in {', '.join(written)}"
     advice = "fill in the column value, and give the file to hilstar calibrate photometric"
-    told = {"bits": bits, "patches": len(planned), "codes": codes, "seed": seed, "written": written}
-    print_found(as_json, told, [line, advice])
+    summary = {
+        "bits": bits,
+        "patches": len(planned),
+        "codes": codes,
+        "seed": seed,
+        "written": written,
+    }
+    print_found(as_json, summary, [line, advice])
     if show:
         shown = show_patches(
             planned, bits, int(display) if display.isdecimal() else display, seconds
@@ -415,9 +432,16 @@ def photometric(
     if as_json:
         print_json(found)
         return
-    black, held = found["black_level"]["relative"], found["holdout"]
-    contrast = f"1 : {1 / black:.0f}" if black > 0 else "unknown: no light at code 0"
-    drift = "not known" if found["drift_percent"] is None else f"{found['drift_percent']:+.2f} %"
+    black = found["black_level"]["relative"]
+    held = found["holdout"]
+    if black > 0:
+        contrast = f"1 : {1 / black:.0f}"
+    else:
+        contrast = "unknown: no light at code 0"
+    if found["drift_percent"] is None:
+        drift = "not known"
+    else:
+        drift = f"{found['drift_percent']:+.2f} %"
     typer.echo(
         f"{'measured':20}{found['codes']} codes above black, {found['bits']} bits; drift {drift}"
     )
@@ -427,10 +451,11 @@ def photometric(
         f"{'held-out levels':20}{held['rms_percent']:.2f} / {held['p95_percent']:.2f} /"
         f" {held['max_percent']:.2f} % (rms / 95 % / max), {held['max_mag']:.4f} mag maximum"
     )
-    for name, one in found["channels"].items() if len(found["channels"]) > 1 else ():
-        rms, under = one["holdout"]["rms_percent"], one["black_level"]["relative"]
+    for name, channel_fit in found["channels"].items() if len(found["channels"]) > 1 else ():
+        rms = channel_fit["holdout"]["rms_percent"]
+        under = channel_fit["black_level"]["relative"]
         typer.echo(
-            f"{'channel ' + name:20}{one['shape']}, held-out levels {rms:.2f} % rms, black"
+            f"{'channel ' + name:20}{channel_fit['shape']}, held-out levels {rms:.2f} % rms, black"
             f" {under:.3e} of its white"
         )
     for decade, percent in (found["crosstalk_percent"] or {}).items():
@@ -474,7 +499,10 @@ def scale(
     file = read_bench_file(bench_file)
     check_files([], [output], file)
     with open_bench(file) as bench:
-        exposure_s = bench.config.tracker.exposure_s if exposure is None else exposure
+        if exposure is None:
+            exposure_s = bench.config.tracker.exposure_s
+        else:
+            exposure_s = exposure
         found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)
     if found.scatter_mag > UNSURE_MAG:
         say(

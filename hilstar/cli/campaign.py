@@ -168,9 +168,9 @@ def campaign(
             )
 
             verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
-            not_met = any(each.verdict == NOT_MET for each in verdicts)
-            summary["requirements"] = [summary_of(each) for each in verdicts]
-            lines += [each.words for each in verdicts]
+            not_met = any(requirement.verdict == NOT_MET for requirement in verdicts)
+            summary["requirements"] = [summary_of(requirement) for requirement in verdicts]
+            lines += [requirement.words for requirement in verdicts]
     finally:
         directory.close()
     lines.append(f"{'page':20}{directory.table.with_name(PAGE_FILE)}")
@@ -201,15 +201,19 @@ def show_cases(
     from hilstar.server.console.run_status import RunSource, RunStatus
     from hilstar.server.record.ledger import LedgerSwitch
 
-    count, begun = 0, 0
-    notices, started_s, said_s = Notices(), time.monotonic(), time.monotonic()
+    count = 0
+    begun = 0
+    notices = Notices()
+    started_s = time.monotonic()
+    said_s = time.monotonic()
     where = str(this.path)
 
     with telling(this.cases) as advance:
 
         def on_done(done: int) -> None:
             nonlocal count, begun, said_s
-            begun, now_s = begun if count else done, time.monotonic()
+            begun = begun if count else done
+            now_s = time.monotonic()
             count = min(done, this.cases)
             advance(count)
             if listener is not None and now_s - said_s >= LINE_S and count > begun:
@@ -224,13 +228,12 @@ def show_cases(
                 running.optional_frames(frames, bench, screen) as feed,
             ):
                 ledger = LedgerSwitch()
-                renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-                told = RunSource(where, renderer, refresh_hz, math.inf, running.forced_on(screen))
+                renderer = bench.renderer.gl_renderer
+                refresh_hz = bench.config.monitor.refresh_hz
+                source = RunSource(where, renderer, refresh_hz, math.inf, running.forced_on(screen))
                 parts = running.page_parts(bench, notices, ledger, screen)
-                page, status = (
-                    RunDescription("campaign", "campaign", where),
-                    RunStatus(told, ledger),
-                )
+                page = RunDescription("campaign", "campaign", where)
+                status = RunStatus(source, ledger)
                 with running.followed(listener, False, page, parts, status, frames=feed) as (
                     sink,
                     follower,

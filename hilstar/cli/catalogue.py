@@ -51,16 +51,19 @@ def catalogue(
         )
     check_outputs([bench_file], [output])
     file = read_bench_file(bench_file)
-    found = bench_catalogue(file, to, epoch)
-    write_catalogue(output, found)
-    told = {
+    bench_stars = bench_catalogue(file, to, epoch)
+    write_catalogue(output, bench_stars)
+    fields = {
         "file": str(output),
-        "stars": len(found),
-        "epoch_jyear": found.epoch_jyear,
-        "zero_points_mag": found.zero_points,
+        "stars": len(bench_stars),
+        "epoch_jyear": bench_stars.epoch_jyear,
+        "zero_points_mag": bench_stars.zero_points,
     }
-    vega, ab = found.zero_points["vega"], found.zero_points["ab"]
+    vega = bench_stars.zero_points["vega"]
+    ab = bench_stars.zero_points["ab"]
     worth = f"an electron per second is {vega:.4f} mag (Vega), {ab:.4f} mag (AB)"
     print_found(
-        as_json, told, [f"{len(found)} stars at J{found.epoch_jyear:g}; {worth}; wrote {output}"]
+        as_json,
+        fields,
+        [f"{len(bench_stars)} stars at J{bench_stars.epoch_jyear:g}; {worth}; wrote {output}"],
     )

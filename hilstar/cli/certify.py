@@ -156,7 +156,8 @@ def _certify(
     from hilstar.instruments.certify.page import text_lines, write_certificate_page
     from hilstar.server.bench.certificate import read_certificate
 
-    path, replaces = output / CERTIFICATE, None
+    path = output / CERTIFICATE
+    replaces = None
     if exists(path):
         if not again:
             raise InputError(
@@ -170,18 +171,20 @@ def _certify(
         say(watched.line)
         warmed = None if watched.law == "none" else watched.bound
     checked = largest_changes(output)
-    found, reference = certified(
+    certificate, reference = certified(
         file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces
     )
-    raw = msgspec.json.format(msgspec.json.encode(found))
+    raw = msgspec.json.format(msgspec.json.encode(certificate))
     digest = sha256_of(raw)
     if reference is not None:
         write_whole(output / REFERENCE, reference)
     write_whole(path, raw)
-    write_certificate_page(output / PAGE, found, digest)
-    told = {**msgspec.to_builtins(found), "sha256": digest, "page": str(output / PAGE)}
+    write_certificate_page(output / PAGE, certificate, digest)
+    fields = {**msgspec.to_builtins(certificate), "sha256": digest, "page": str(output / PAGE)}
     print_found(
-        as_json, told, (f"{name:26}{text}" for name, text in text_lines(found, digest, output))
+        as_json,
+        fields,
+        (f"{name:26}{text}" for name, text in text_lines(certificate, digest, output)),
     )
 
 
@@ -203,7 +206,8 @@ def _check(
     )
     from hilstar.server.bench.certificate import read_certificate
 
-    reference, since = read_reference(output / REFERENCE), "the bench file"
+    reference = read_reference(output / REFERENCE)
+    since = "the bench file"
     if exists(output / CERTIFICATE):
         since = read_certificate(output / CERTIFICATE).number
     elif reference is None:
@@ -211,30 +215,32 @@ def _check(
             f"{output}: has no certificate; the check is against the bench file (hilstar certify"
             f" {file.path.name} -o {output})"
         )
-    warmed = (
-        watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up")
-        if warm_up
-        else None
-    )
+    if warm_up:
+        warmed = watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up")
+    else:
+        warmed = None
     figures = compare(file, reference or by_bench_file(file), take_check(file, reader))
     rows = record(output, now, since, figures)
-    good = all(each.in_tolerance for each in figures)
+    good = all(figure.in_tolerance for figure in figures)
     lines = []
-    for each in figures:
-        u = f"{each.value:+.4g} +- {(each.upper - each.lower) / 2:.2g} {each.unit}"
+    for figure in figures:
+        u = f"{figure.value:+.4g} +- {(figure.upper - figure.lower) / 2:.2g} {figure.unit}"
         lines.append(
-            f"{each.quantity:16}{u:28}{'in' if each.in_tolerance else 'OUT OF'} tolerance"
-            f" ({each.threshold:.2g})"
+            f"{figure.quantity:16}{u:28}{'in' if figure.in_tolerance else 'OUT OF'} tolerance"
+            f" ({figure.threshold:.2g})"
         )
     lines += [f"{'since':16}{since}", *([] if warmed is None else [f"{'warm-up':16}{warmed.line}"])]
-    verdict = "the bench is as certified" if good else "the bench has moved: certify it --again"
+    if good:
+        verdict = "the bench is as certified"
+    else:
+        verdict = "the bench has moved: certify it --again"
     lines.append(f"{'verdict':16}{verdict}")
-    found = {
+    fields = {
         "certificate": since,
         "in_tolerance": good,
         "checks": len({row["made"] for row in rows}),
     }
-    print_found(as_json, found | {"figures": figures, "warm_up": warmed}, lines)
+    print_found(as_json, fields | {"figures": figures, "warm_up": warmed}, lines)
     if not good:
         raise typer.Exit(1)
 
@@ -257,7 +263,10 @@ def _reader(
     from hilstar.instruments.certify.readings import ImageReader, VirtualReader
     from hilstar.server.bench.bench_file import read_bench_file
 
-    truth = None if virtual is None else read_bench_file(virtual)
+    if virtual is None:
+        truth = None
+    else:
+        truth = read_bench_file(virtual)
     if truth is None and grab is None:
         return None
     if truth is not None and not whole:

@@ -62,9 +62,11 @@ def compare(
             " light of their own in view"
         )
         typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
-        each = {"": summary} | {f", {name}": one for name, one in summary["channels"].items()}
+        by_channel = {"": summary} | {
+            f", {name}": channel_summary for name, channel_summary in summary["channels"].items()
+        }
         for (name, unit), (channel, figures) in product(
-            (("flux", "mag"), ("centroid", "px")), each.items()
+            (("flux", "mag"), ("centroid", "px")), by_channel.items()
         ):
             limit = summary["limits"][f"{name}_{unit}"]
             three = " / ".join(
@@ -78,11 +80,10 @@ def compare(
             why = "for rounding of the light around them or the image's edge"
             typer.echo(f"{'wider limits':20}{summary['widened']} stars, {why}")
         typer.echo(f"{'missing, extra':20}{summary['missing']}, {summary['extra']}")
-        where = (
-            " (-o DIR writes a table of all)"
-            if output is None
-            else f" (in {output / 'compare.csv'})"
-        )
+        if output is None:
+            where = " (-o DIR writes a table of all)"
+        else:
+            where = f" (in {output / 'compare.csv'})"
         for line in star_lines(comparison, MAX_LINES, where):
             typer.echo(f"{'':20}{line}")
         typer.echo(f"{'verdict':20}{'the same sky' if comparison.same else 'NOT the same sky'}")

@@ -58,20 +58,19 @@ def confront(
     from hilstar.server.bench.bench_file import BenchFile as ReadFile
 
     check_directory("-o", output)
-    start = (
-        None
-        if radec is None and quaternion is None
-        else parse_attitude("confront", radec, quaternion)
-    )
+    if radec is None and quaternion is None:
+        start = None
+    else:
+        start = parse_attitude("confront", radec, quaternion)
     at_ns = None if at is None else parse_utc(at)
     file: ReadFile = read_tracker_file(bench_file)[0]
     check_files(images, [output / name for name in OUTPUTS], file)
     tell = (lambda line: None) if as_json else typer.echo
-    found = confront_files(
+    confronted = confront_files(
         bench_file, images, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell
     )
-    print_found(as_json, found.figures, [*found.lines, f"page: {output / 'index.html'}"])
-    for note in (*found.notes, *found.failures):
+    print_found(as_json, confronted.figures, [*confronted.lines, f"page: {output / 'index.html'}"])
+    for note in (*confronted.notes, *confronted.failures):
         say(note)
-    if strict and found.failures:
+    if strict and confronted.failures:
         raise typer.Exit(1)

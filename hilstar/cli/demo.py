@@ -96,11 +96,10 @@ def demo(
                 bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker
             )
 
-        shows = (
-            Shows(demo_file, samples)
-            if tracker is None
-            else Shows(tracker.bench_file, samples, tracker.watches)
-        )
+        if tracker is None:
+            shows = Shows(demo_file, samples)
+        else:
+            shows = Shows(tracker.bench_file, samples, tracker.watches)
         result = run_demo(output, seconds, shows, watching)
     if result.kept and caught() is None:  # no pictures after Ctrl-C
         if not as_json:
@@ -156,12 +155,12 @@ def _watching(
     with (
         running.optional_ledger(
             None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT
-        ) as kept,
-        running.optional_answers(bench, notices, kept, None) as answers,
+        ) as ledger,
+        running.optional_answers(bench, notices, ledger, None) as answers,
         running.optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
         nullcontext() if tracker is None or frames is None else tracker.before(frames),
     ):
-        parts = running.page_parts(bench, notices, kept, answers=answers)
+        parts = running.page_parts(bench, notices, ledger, answers=answers)
         page = RunDescription("demo", bench.config.attitude.source, endpoint)
         with running.followed(listener, control, page, parts, status, advance, frames) as (
             sink,
@@ -170,7 +169,9 @@ def _watching(
         ):
             yield (
                 sink,
-                Outlet(None, kept, notices, follower=follower, requests=requests, answers=answers),
+                Outlet(
+                    None, ledger, notices, follower=follower, requests=requests, answers=answers
+                ),
             )
     running.refuse_lost_gpu(notices)
 
@@ -184,7 +185,8 @@ def tracker_beside(
     """
     make_directory(folder)
     with temporary_folder("loop") as place:
-        endpoint, bench_file = f"ipc://{place.resolve()}/answers", folder / "loop.toml"
+        endpoint = f"ipc://{place.resolve()}/answers"
+        bench_file = folder / "loop.toml"
         answers = (
             f'[answers]\nsource = "zmq"\nformat = "json"\nclock = "host"\nendpoint = "{endpoint}"\n'
         )
@@ -200,11 +202,9 @@ class TrackerBeside:
     def __init__(
         self, folder: Path, bench_file: Path, answers: str, seconds: float, seed: int
     ) -> None:
-        self.ledger, self.bench_file, self._page = (
-            folder / "loop.mcap",
-            bench_file,
-            folder / "budget.html",
-        )
+        self.ledger = folder / "loop.mcap"
+        self.bench_file = bench_file
+        self._page = folder / "budget.html"
         self._words = [
             "--answer",
             answers,
@@ -245,10 +245,12 @@ class TrackerBeside:
         if self._process is None or self._feed is None:
             return False
         if self._process.poll() is not None:
-            said = (
+            error_lines = (
                 self._process.stderr.read().strip().splitlines() if self._process.stderr else []
             ) or ["nothing"]
-            raise MachineError(f"the demo's tracker ended before the run; it said: {said[-1]}")
+            raise MachineError(
+                f"the demo's tracker ended before the run; it said: {error_lines[-1]}"
+            )
         return self._feed.watched
 
     def report(self, live: object, as_json: bool) -> None:
@@ -262,15 +264,14 @@ class TrackerBeside:
         from hilstar.server.answers.judge import TrackerFigures
 
         try:
-            found = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
+            assessment = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
         except InputError as refusal:  # what is read here this machine has made
             raise MachineError(f"the demo's run gives no budget: {refusal}") from refusal
-        write_page(self._page, found)
-        parts = found.found
-        rows: list[tuple[str, float, float | None, str]] = [
-            ("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec")
-            for k, axis in enumerate("xyz")
-        ]
+        write_page(self._page, assessment)
+        parts = assessment.found
+        rows: list[tuple[str, float, float | None, str]] = []
+        for k, axis in enumerate("xyz"):
+            rows.append(("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec"))
         for name, planted, axes in (
             ("field-of-view error", FOV_ARCSEC, parts.fov_arcsec),
             ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
@@ -281,16 +282,16 @@ class TrackerBeside:
             ]
         if isinstance(live, TrackerFigures) and live.answers:
             rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
-        told = {
+        fields = {
             "loop": [
                 {"quantity": name, "planted": a, "found": b, "unit": unit}
                 for name, a, b, unit in rows
             ]
         }
         if as_json:
-            say(json.dumps(told))
+            say(json.dumps(fields))
             return
-        for what, text in lines_of(found):
+        for what, text in lines_of(assessment):
             typer.echo(f"{what:24}{text}")
         typer.echo(f"{'page':24}{self._page}")
         typer.echo(f"{'':28}{'planted':>10}{'found':>10}")

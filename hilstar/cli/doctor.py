@@ -46,7 +46,10 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
     result = examine()
     for bench in benches.values():
         say_units(bench.fields)  # a star that is too wide is on the page, with its panels
-    named = {"benches": {name: bench.keys() for name, bench in benches.items()}} if benches else {}
+    if benches:
+        named = {"benches": {name: bench.keys() for name, bench in benches.items()}}
+    else:
+        named = {}
     lines = [check.line() for check in result.checks]
     lines += [line for output in result.outputs for line in output.lines()]
     lines += [line for name, bench in benches.items() for line in bench.lines(name)]

@@ -114,19 +114,19 @@ def _run(words: list[str]) -> int:
 
 def usage_line(error: Any, words: list[str]) -> str:
     """The line for a wrong command line: typer's `error`, and what to write instead."""
-    said = str(error.format_message()).replace("Value error, ", "").rstrip(".")
-    said = re.sub(
+    message = str(error.format_message()).replace("Value error, ", "").rstrip(".")
+    message = re.sub(
         r"a valid (float|int)\w*( range)?",
         lambda m: "a number" if m[1] == "float" else "a whole number",
-        said,
+        message,
     )
     at = getattr(error, "ctx", None)
     see = f"(see {'hilstar' if at is None else at.command_path} --help)"
     if (spaced := _spaced_numbers(words)) is not None:
         return spaced
-    if said.startswith("Missing option") and (missing := _missing_file(words)) is not None:
+    if message.startswith("Missing option") and (missing := _missing_file(words)) is not None:
         return f"{missing}: no such file; give one that is there {see}"
-    if (other := re.match(r"No such command '(.*?)'", said)) and at is not None:
+    if (other := re.match(r"No such command '(.*?)'", message)) and at is not None:
         known = list(getattr(at.command, "commands", {}))
         advice = (
             ELSEWHERE.get(other[1])
@@ -134,21 +134,20 @@ def usage_line(error: Any, words: list[str]) -> str:
             or f"the commands are {', '.join(known)}"
         )
         return f"No such command '{shortened(other[1])}'; {advice} {see}"
-    if said.startswith("No such option") and at is not None:
-        known = [
-            name
-            for one in at.command.params
-            for name in (*one.opts, *one.secondary_opts)
-            if name.startswith("-")
-        ]
+    if message.startswith("No such option") and at is not None:
+        known = []
+        for parameter in at.command.params:
+            for name in (*parameter.opts, *parameter.secondary_opts):
+                if name.startswith("-"):
+                    known.append(name)
         advice = (
             did_you_mean(error.option_name, known).strip() or f"its options are {', '.join(known)}"
         )
         return f"No such option: {shortened(error.option_name)}; {advice} {see}"
-    if choice := re.search(r"'([^']*)' is not one of (.*)", said):
+    if choice := re.search(r"'([^']*)' is not one of (.*)", message):
         meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2])).strip()
-        return f"{said}{meant and '; '}{meant} {see}"
-    return f"{said} {see}"
+        return f"{message}{meant and '; '}{meant} {see}"
+    return f"{message} {see}"
 
 
 def _missing_file(words: list[str]) -> str | None:
@@ -173,7 +172,10 @@ def _spaced_numbers(words: list[str]) -> str | None:
     for k, word in enumerate(words):
         option, is_joined, first = word.partition("=")
         rest = ([first] if is_joined else []) + words[k + 1 :]
-        parts = list(takewhile(NUMBERS.fullmatch, rest)) if option in NUMBER_OPTIONS else []
+        if option in NUMBER_OPTIONS:
+            parts = list(takewhile(NUMBERS.fullmatch, rest))
+        else:
+            parts = []
         if len(parts) > 1:
             numbers = ",".join(",".join(parts).replace(",", " ").split())
             return (

@@ -155,7 +155,10 @@ def first_light(
     if count is not None and count > MAX_FRAMES:
         raise InputError(f"--frames {count}: write at most {MAX_FRAMES}")
     by_hand = grab is None and virtual is None
-    readings = (0 if by_hand else PATCHES) if patches is None else patches
+    if patches is None:
+        readings = 0 if by_hand else PATCHES
+    else:
+        readings = patches
     if by_hand and warm_up:
         raise InputError(
             "--warm-up: a person cannot save an image every ten seconds; give --grab CMD, or leave"
@@ -189,10 +192,12 @@ def first_light(
         if beats is not None:
             tell(beats)
         page = write_page(output, session.as_file(), output / BEFORE_FILE)
-    found = session.as_file()
-    lines = [f"{record.name:12} {record.verdict:8} {record.line}" for record in found.steps]
+    session_file = session.as_file()
+    lines = [f"{record.name:12} {record.verdict:8} {record.line}" for record in session_file.steps]
     print_found(
-        as_json, msgspec.to_builtins(found) | {"page": str(page)}, [*lines, f"{'page':12} {page}"]
+        as_json,
+        msgspec.to_builtins(session_file) | {"page": str(page)},
+        [*lines, f"{'page':12} {page}"],
     )
     if code:
         raise typer.Exit(code)

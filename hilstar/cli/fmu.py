@@ -61,8 +61,14 @@ def _address(path: Path, settings: object) -> str:
         raise InputError(
             f"{path}: [attitude] status_hz = 0, by which an FMU hears nothing; write 10 or more"
         )
-    host = "[::1]" if place.host.version == 6 else "127.0.0.1"
-    named = f"[{place.host}]" if place.host.version == 6 else str(place.host)
+    if place.host.version == 6:
+        host = "[::1]"
+    else:
+        host = "127.0.0.1"
+    if place.host.version == 6:
+        named = f"[{place.host}]"
+    else:
+        named = str(place.host)
     return f"{host if place.host.is_unspecified else named}:{place.port}"
 
 

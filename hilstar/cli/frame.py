@@ -88,7 +88,7 @@ def frame(
             "clipped_mag": bench.losses_mag(shot, effects),
             "left_out": left_out(shot.rows),
             "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
-            "faults": [] if effects is None else [one.fault.name for one in effects.now],
+            "faults": [] if effects is None else [active.fault.name for active in effects.now],
             "written": [str(path) for path in targets],
             "fields_of_view": fields.keys(),
             "star": star.keys(),

@@ -54,7 +54,10 @@ def image_source(
         return VirtualBench(file, read_bench_file(virtual), seed)
     if dark is not None:
         read_image(dark, file.config.tracker.resolution_px)
-    recorder = None if diode is None else SerialDiode(*parse_diode(diode))
+    if diode is None:
+        recorder = None
+    else:
+        recorder = SerialDiode(*parse_diode(diode))
     if grab is None:
         return ByHand(dark, recorder)
     if grab.startswith(PREFIX):

@@ -60,13 +60,13 @@ def latency(
             " serial:/dev/ttyX@115200"
         )
     if diode is None:
-        found = by_diode.read_edges(edges or Path())
+        edges_read = by_diode.read_edges(edges or Path())
     else:
-        found = by_diode.capture_edges(*parse_diode(diode), duration)
+        edges_read = by_diode.capture_edges(*parse_diode(diode), duration)
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
-        by_diode.save_edges(save, found)
-    summary = by_diode.measure_latency(ledger, found, output)
+        by_diode.save_edges(save, edges_read)
+    summary = by_diode.measure_latency(ledger, edges_read, output)
     print_found(as_json, summary, by_diode.latency_lines(summary))
     if write is not None:
         by_diode.write_panel_delay(write, summary["panel_delay_ms"], summary["panel_delay_u_ms"])

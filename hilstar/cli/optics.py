@@ -156,7 +156,8 @@ def lens(
         size = round(wide), round(high)
     if bench is not None:
         tracker = read_bench_file(bench).config.tracker
-        pitch_um, size = pitch_um or tracker.pixel_pitch_um, size or tracker.resolution_px
+        pitch_um = pitch_um or tracker.pixel_pitch_um
+        size = size or tracker.resolution_px
     if pitch_um is None or size is None:
         raise InputError(
             "a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and"
@@ -168,17 +169,17 @@ def lens(
         "--focuses-um",
         "--focuses-um in um, such as -20,0,20",
     )
-    found = glass_of_prescription(
+    glass = glass_of_prescription(
         prescription, Plate(size, pitch_um, tuple(focuses), half_px), oversampling, tolerance
     )
-    for note in found.notes:
+    for note in glass.notes:
         say(f"{prescription}: {note}")
-    facts: dict[str, Any] = {"focal_length_mm": found.focal_length_mm, "f_number": found.f_number}
-    _tell(output, found.glass, as_json, {**facts, "notes": list(found.notes)})
+    facts: dict[str, Any] = {"focal_length_mm": glass.focal_length_mm, "f_number": glass.f_number}
+    _tell(output, glass.glass, as_json, {**facts, "notes": list(glass.notes)})
     if not as_json:
         typer.echo(
-            f"in the bench file, under [tracker]: focal_length_mm = {found.focal_length_mm:.6g}  #"
-            f" F/{found.f_number:.3g}"
+            f"in the bench file, under [tracker]: focal_length_mm = {glass.focal_length_mm:.6g}  #"
+            f" F/{glass.f_number:.3g}"
         )
 
 
@@ -200,7 +201,10 @@ def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, Any] | No
         **(more or {}),
         "written": [str(output)],
     }
-    colours = f"{len(glass.wavelengths_nm)} wavelengths" if known else "one PSF for all light"
+    if known:
+        colours = f"{len(glass.wavelengths_nm)} wavelengths"
+    else:
+        colours = "one PSF for all light"
     line = (
         f"{len(glass.places_px)} field points, {colours}, {len(glass.focuses_um)} focus positions:"
         f" {len(glass.basis)}"

@@ -138,7 +138,10 @@ def check_files(
     The bench file and all files that it names count as inputs; `kept` is an output that cannot be
     made again.
     """
-    named = [] if file is None else files_named_in(file.path, file.text)
+    if file is None:
+        named = []
+    else:
+        named = files_named_in(file.path, file.text)
     check_outputs([*inputs, *named], [*outputs, kept])
     if kept is not None:
         refuse_writer(kept)
@@ -334,7 +337,10 @@ class LogStatements:
         from hilstar.attitude.wire.source import Convention
         from hilstar.server.bench.bench_file import stated_in
 
-        by_file = Stated() if config is None else stated_in(config)
+        if config is None:
+            by_file = Stated()
+        else:
+            by_file = stated_in(config)
         stated = replace(
             by_file, kernels=tuple(self.kernel or ()), topic=self.topic, body=self.body
         )
@@ -411,7 +417,10 @@ def parse_diode(text: str) -> tuple[str, int]:
 def parse_share(text: str, option: str) -> float:
     """A share from "5%" or "0.05". Raises InputError."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
-    share = float(match[1]) / (100.0 if match[2] else 1.0) if match else 2.0
+    if match:
+        share = float(match[1]) / (100.0 if match[2] else 1.0)
+    else:
+        share = 2.0
     if share > 1.0:
         raise InputError(f"{option} {text}: write a fraction of the packets, such as 5% or 0.05")
     return share
@@ -438,10 +447,15 @@ def parse_split(text: str | None) -> "SplitLimits":
     if text is None:
         return NO_SPLIT
     match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(kB|MB|GB|s|min|h)", text.strip())
-    value = float(match[1]) * SPLIT_UNITS[match[2]] if match else 0.0
+    if match:
+        value = float(match[1]) * SPLIT_UNITS[match[2]]
+    else:
+        value = 0.0
     if match is None or value < (MIN_SPLIT_BYTES if match[2].endswith("B") else MIN_SPLIT_S):
         raise InputError(f"--ledger-split {text}: {SPLIT_FORM}")
-    return SplitLimits(bytes=value) if match[2].endswith("B") else SplitLimits(seconds=value)
+    if match[2].endswith("B"):
+        return SplitLimits(bytes=value)
+    return SplitLimits(seconds=value)
 
 
 def parse_memory(text: str) -> int:
@@ -479,10 +493,14 @@ def parse_counts(text: str, most: int) -> tuple[int, ...]:
 
 def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
     """Image sizes, each once, from "640x480,1920x1080". Raises InputError."""
-    found = [re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", part) for part in text.split(",")]
-    if not all(match and max(int(match[1]), int(match[2])) <= MAX_SIZE_PX for match in found):
+    size_matches = [
+        re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", part) for part in text.split(",")
+    ]
+    if not all(
+        match and max(int(match[1]), int(match[2])) <= MAX_SIZE_PX for match in size_matches
+    ):
         raise InputError(
             f"--sizes {text}: write WIDTHxHEIGHT, up to {MAX_SIZE_PX} px, with commas between them,"
             " such as 640x480,1920x1080"
         )
-    return tuple(dict.fromkeys((int(match[1]), int(match[2])) for match in found if match))
+    return tuple(dict.fromkeys((int(match[1]), int(match[2])) for match in size_matches if match))

@@ -94,9 +94,9 @@ def replay(
             file, headless, windowed, force, timed=play.paced and not play.moving
         ) as (bench, screen),
         FrameImages(output, bench) as record,
-        running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
-        running.run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
-        running.optional_answers(bench, notices, kept, screen) as answers,
+        running.optional_ledger(ledger, bench, notices, overwrite, split) as run_ledger,
+        running.run_with_faults(bench, faults, notices, run_ledger, play.recording) as wrong,
+        running.optional_answers(bench, notices, run_ledger, screen) as answers,
         running.optional_frames(frames, bench, screen) as watched,
     ):
         if play.span:
@@ -107,13 +107,14 @@ def replay(
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))
         # Before the run: what would do takes seconds, and a run that is stopped ends at once.
         effort = running.effort_of_run(bench, explain, as_json)
-        renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-        told = RunSource(
+        renderer = bench.renderer.gl_renderer
+        refresh_hz = bench.config.monitor.refresh_hz
+        source = RunSource(
             f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen)
         )
-        status = RunStatus(told, kept)
+        status = RunStatus(source, run_ledger)
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
-        parts = running.page_parts(bench, notices, kept, screen, wrong, answers, split=split)
+        parts = running.page_parts(bench, notices, run_ledger, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
             running.followed(listener, control, page, parts, status, record, watched) as (
@@ -122,7 +123,9 @@ def replay(
                 requests,
             ),
         ):
-            outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
+            outlet = Outlet(
+                screen, run_ledger, notices, None, follower, requests, wrong, pulse, answers
+            )
             summary = replay_log(bench, play, sink, outlet)
         summary = replaced(summary, **effort)
-    running.end_of_run(summary, screen, kept, notices, as_json, strict)
+    running.end_of_run(summary, screen, run_ledger, notices, as_json, strict)

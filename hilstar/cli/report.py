@@ -25,6 +25,6 @@ def report(
     from hilstar.server.record.report import table_rows
 
     check_directory("-o", output)
-    found = write_report(ledger, output)
-    rows = [*table_rows(found), ("page", output / "report.html")]
-    print_found(as_json, found, (f"{what:32}{how_much}" for what, how_much in rows))
+    figures = write_report(ledger, output)
+    rows = [*table_rows(figures), ("page", output / "report.html")]
+    print_found(as_json, figures, (f"{what:32}{how_much}" for what, how_much in rows))

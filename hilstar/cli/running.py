@@ -246,16 +246,17 @@ def say_beat(bench: Any, screen: Any) -> "BeatSummary":
     """
     from hilstar.server.sync import beat_line, beat_of
 
-    measured_hz = (
-        NS_PER_S / screen.clock.period_ns
-        if screen is not None and screen.clock.paced_by_screen
-        else None
+    if screen is not None and screen.clock.paced_by_screen:
+        measured_hz = NS_PER_S / screen.clock.period_ns
+    else:
+        measured_hz = None
+    frame_beat = beat_of(
+        bench.config, measured_hz, () if screen is None else screen.window.modes_hz
     )
-    found = beat_of(bench.config, measured_hz, () if screen is None else screen.window.modes_hz)
-    line = beat_line(found)
+    line = beat_line(frame_beat)
     if line is not None:
         say(line)
-    return found
+    return frame_beat
 
 
 @contextmanager
@@ -452,13 +453,12 @@ def scpi_listener(
         return
     token = token if page is None else page.token or None
     with PageListener(parse_address(scpi, "--scpi"), token, option="--scpi") as listener:
-        secret = (
-            f', SYST:AUTH "{listener.token}" first'
-            if listener.made
-            else ", SYST:AUTH first"
-            if listener.token
-            else ""
-        )
+        if listener.made:
+            secret = f', SYST:AUTH "{listener.token}" first'
+        elif listener.token:
+            secret = ", SYST:AUTH first"
+        else:
+            secret = ""
         say(f"SCPI is at {listener.host}:{listener.port}{secret}")
         yield listener
 
@@ -547,7 +547,7 @@ def _all_of(sinks: "list[FrameSink]") -> "FrameSink":
         return sinks[0]
 
     def sink(shown: "Shown") -> None:
-        for one in sinks:
-            one(shown)
+        for next_sink in sinks:
+            next_sink(shown)
 
     return sink

@@ -163,25 +163,25 @@ def wanted_samples(
 
 def tell(tally: Any, link: Any, as_json: bool) -> None:
     """Print what was sent and what was lost."""
-    told = {"packets": tally.total, "sent": tally.total - tally.lost}
-    told |= {name: getattr(tally, name) for name in ("lost", "corrupted", "reordered")}
-    told |= {
+    fields = {"packets": tally.total, "sent": tally.total - tally.lost}
+    fields |= {name: getattr(tally, name) for name in ("lost", "corrupted", "reordered")}
+    fields |= {
         name: getattr(link, name)
         for name in ("requests", "statuses", "unsent")
         if hasattr(link, name)
     }
-    told["link"] = {"endpoint": link.endpoint} | link.link_counts.summary()
+    fields["link"] = {"endpoint": link.endpoint} | link.link_counts.summary()
     if as_json:
-        print_json(told)
+        print_json(fields)
         return
     faults = ", ".join(
-        f"{told[name]} {name}"
+        f"{fields[name]} {name}"
         for name in ("lost", "corrupted", "reordered", "unsent")
-        if told.get(name)
+        if fields.get(name)
     )
-    say(f"{told['sent']} packets sent" + (f" ({faults})" if faults else ""))
-    if told.get("statuses"):
-        say(f"{told['statuses']} statuses heard, {told['requests']} time requests answered")
+    say(f"{fields['sent']} packets sent" + (f" ({faults})" if faults else ""))
+    if fields.get("statuses"):
+        say(f"{fields['statuses']} statuses heard, {fields['requests']} time requests answered")
 
 
 def heard(sender: Any, wait_s: float, stop: threading.Event) -> bool:

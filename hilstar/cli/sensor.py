@@ -75,5 +75,10 @@ def _tell(output: Path, sensor: "SensorFile", source: str, as_json: bool) -> Non
 
     files = write_sensor(output, sensor, source)
     written = [str(file) for file in files]
-    told = {"keys": sensor.keys, "sigmas": sensor.sigmas, "notes": sensor.notes, "written": written}
-    print_found(as_json, told, [*sensor.lines, *sensor.notes, f"wrote {', '.join(written)}"])
+    fields = {
+        "keys": sensor.keys,
+        "sigmas": sensor.sigmas,
+        "notes": sensor.notes,
+        "written": written,
+    }
+    print_found(as_json, fields, [*sensor.lines, *sensor.notes, f"wrote {', '.join(written)}"])

@@ -69,18 +69,28 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not link.steps  # read_heads refuses lockstep
-        told = run_heads(asked, link, say)
-    lines, verdicts = [], []
-    for name, head in told.items():
+        head_summaries = run_heads(asked, link, say)
+    lines = []
+    verdicts = []
+    for name, head in head_summaries.items():
         summary = head["summary"]
-        frames = summary.get("frames") if isinstance(summary, dict) else None
-        counted = "no summary" if frames is None else f"{frames} frames"
-        again = f", started again {head['restarts']} times" if head["restarts"] else ""
+        if isinstance(summary, dict):
+            frames = summary.get("frames")
+        else:
+            frames = None
+        if frames is None:
+            counted = "no summary"
+        else:
+            counted = f"{frames} frames"
+        if head["restarts"]:
+            again = f", started again {head['restarts']} times"
+        else:
+            again = ""
         lines.append(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
         if isinstance(summary, dict) and "verdict" in summary:
             verdicts.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
-    print_found(as_json, {"heads": told}, [*lines, *verdicts])
-    codes = [head["exit_code"] for head in told.values()]
+    print_found(as_json, {"heads": head_summaries}, [*lines, *verdicts])
+    codes = [head["exit_code"] for head in head_summaries.values()]
     if all(code == NO_ATTITUDE for code in codes):
         raise typer.Exit(NO_ATTITUDE)
     failed = [code for code in codes if code not in {0, NO_ATTITUDE}]
@@ -98,13 +108,16 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
         raise InputError(
             f"--console {console}: {count} pages need as many ports from there; choose a lower one"
         )
-    addresses = [
-        ListenAddress(first.host, first.port + k if first.port else 0) for k in range(count)
-    ]
+    addresses = []
+    for k in range(count):
+        addresses.append(ListenAddress(first.host, first.port + k if first.port else 0))
     with ExitStack() as doors:
         for address in addresses:
             doors.enter_context(PageListener(address, token))
-    host = f"[{first.host}]" if ":" in first.host else first.host
+    if ":" in first.host:
+        host = f"[{first.host}]"
+    else:
+        host = first.host
     return tuple(f"{host}:{address.port}" for address in addresses)
 
 
@@ -181,14 +194,16 @@ def serve(
             "--control": control,
         }
         switches |= {"--overwrite": overwrite, "--explain": explain, "--strict": strict}
-        words = [
+        head_options = [
             word
             for name, value in valued.items()
             if value is not None
             for word in (name, str(value))
         ]
-        words += [name for name, on in switches.items() if on]
-        asked = HeadsRun(file, tuple(words), duration, running.dated_ledger(ledger), token=token)
+        head_options += [name for name, on in switches.items() if on]
+        asked = HeadsRun(
+            file, tuple(head_options), duration, running.dated_ledger(ledger), token=token
+        )
         serve_heads(asked, console, overwrite, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
@@ -212,9 +227,9 @@ def serve(
         running.shown_bench(
             file, headless, windowed, force, timed=not file.config.attitude.lockstep
         ) as (bench, screen),
-        running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
-        running.run_with_faults(bench, faults, notices, kept) as wrong,
-        running.optional_answers(bench, notices, kept, screen) as answers,
+        running.optional_ledger(ledger, bench, notices, overwrite, split) as run_ledger,
+        running.run_with_faults(bench, faults, notices, run_ledger) as wrong,
+        running.optional_answers(bench, notices, run_ledger, screen) as answers,
         running.optional_frames(watch, bench, screen) as watched,
     ):
         if explain:
@@ -233,15 +248,15 @@ def serve(
         optics = running.say_seen(bench) | effort
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
-        told = RunSource(
+        source = RunSource(
             link.endpoint,
             bench.renderer.gl_renderer,
             refresh_hz,
             limit.shortest,
             running.forced_on(screen),
         )
-        status = RunStatus(told, kept)
-        parts = running.page_parts(bench, notices, kept, screen, wrong, answers, split=split)
+        status = RunStatus(source, run_ledger)
+        parts = running.page_parts(bench, notices, run_ledger, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
             running.followed(
@@ -256,7 +271,7 @@ def serve(
         ):
             outlet = Outlet(
                 screen,
-                kept,
+                run_ledger,
                 notices,
                 tracker_pictures(link, bench, wrong),
                 *fed[1:],
@@ -266,7 +281,7 @@ def serve(
             )
             summary = serve_stream(bench, link, limit, fed[0], outlet)
     whole_summary = replaced(summary, beat=beat, **optics)
-    running.end_of_run(whole_summary, screen, kept, notices, as_json, strict)
+    running.end_of_run(whole_summary, screen, run_ledger, notices, as_json, strict)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets, link.trouble))
         raise typer.Exit(NO_ATTITUDE)
@@ -279,7 +294,10 @@ def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
     from hilstar.server.console.publisher import RunDescription
 
     source = file.config.attitude
-    steer_port = int(link.endpoint.rpartition(":")[2]) if source.source == "scpi" else 0
+    if source.source == "scpi":
+        steer_port = int(link.endpoint.rpartition(":")[2])
+    else:
+        steer_port = 0
     return RunDescription(
         "serve", source.source, link.endpoint, "asked" if source.lockstep else "clock", steer_port
     )

@@ -102,11 +102,11 @@ def install(
     from hilstar.server.bench.bench_file import read_bench_file
 
     read_bench_file(bench_file)
-    words, console = _checked(bench_file, options or [])
+    command_words, console = _checked(bench_file, options or [])
     service = unit_name(name or bench_file.stem)
     path = units_folder() / service
     confined = can_confine()
-    text = unit_text(path, bench_file.resolve(), words, confined)
+    text = unit_text(path, bench_file.resolve(), command_words, confined)
     if not confined:
         say(
             "this system gives users no namespace of their own: the unit keeps the capabilities"
@@ -155,10 +155,14 @@ def uninstall(
     bare = name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
     path = units_folder() / unit_name(bare)
     if not os.path.lexists(path):
-        found = sorted(
-            each.stem.removeprefix("hilstar-") for each in path.parent.glob("hilstar-*.service")
+        installed = sorted(
+            unit_path.stem.removeprefix("hilstar-")
+            for unit_path in path.parent.glob("hilstar-*.service")
         )
-        there = f"there is {', '.join(found)}" if found else "there is none"
+        if installed:
+            there = f"there is {', '.join(installed)}"
+        else:
+            there = "there is none"
         raise InputError(f"{path}: no such service; {there}")
     stopped = _systemctl("disable", "--now", path.name)
     try:
@@ -188,12 +192,14 @@ def _systemctl(*words: str) -> bool:
 def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
     from hilstar.server.console.listener import parse_address
 
-    words = with_values(options)
+    option_words = with_values(options)
     alone = typer.Typer()
     alone.command()(serve)
     try:
         given = (
-            typer.main.get_command(alone).make_context("serve", [str(bench_file), *words]).params
+            typer.main.get_command(alone)
+            .make_context("serve", [str(bench_file), *option_words])
+            .params
         )
     except Exception as error:  # typer's usage errors have no public base class in all its versions
         message = getattr(error, "format_message", None)
@@ -210,7 +216,7 @@ def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAd
             f"--ledger {given['ledger']}: each start needs a ledger of its own; write"
             f" run-{UTC_MARK}.mcap"
         )
-    return words, None if given["console"] is None else parse_address(given["console"])
+    return option_words, None if given["console"] is None else parse_address(given["console"])
 
 
 def can_confine() -> bool:
@@ -264,14 +270,17 @@ def unit_text(
         *options,
     ]
     folder = Path.cwd()
-    found = {name: environment[name] for name in DISPLAY_VARIABLES if environment.get(name)}
+    display_variables = {
+        name: environment[name] for name in DISPLAY_VARIABLES if environment.get(name)
+    }
     return UNIT.format(
         path=path,
         bench=_literal(bench.name),
         command=" ".join(_quoted(word) for word in command),
         folder=_literal(str(folder)),
         display="".join(
-            f"Environment={_quoted(f'{name}={value}')}\n" for name, value in found.items()
+            f"Environment={_quoted(f'{name}={value}')}\n"
+            for name, value in display_variables.items()
         ),
         tokens=_literal(str(path.with_suffix(".env"))),
         confined=CONFINED if confined else "",
@@ -288,4 +297,6 @@ def _literal(text: str) -> str:
 
 def _quoted(word: str) -> str:
     text = _literal(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
-    return text if re.fullmatch(r"[A-Za-z0-9_@%+=:,./{}-]+", text) else f'"{text}"'
+    if re.fullmatch(r"[A-Za-z0-9_@%+=:,./{}-]+", text):
+        return text
+    return f'"{text}"'

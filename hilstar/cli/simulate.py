@@ -87,15 +87,17 @@ def simulate(
     q = options.parse_attitude("simulate", radec, quaternion)
     t_ns = options.parse_at("simulate", at, file.config, wrong is not None)
     file = at_moment(file, t_ns)
-    rate_rad_s = (
-        np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s"))
-        if rate
-        else np.zeros(3)
-    )
+    if rate:
+        rate_rad_s = np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s"))
+    else:
+        rate_rad_s = np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         view = simulator.view(q, rate_rad_s, t_ns)
-        faults = None if wrong is None else faulty_exposure(simulator, view, wrong, t_ns or 0)
+        if wrong is None:
+            faults = None
+        else:
+            faults = faulty_exposure(simulator, view, wrong, t_ns or 0)
         exposure = simulator.expose(view, frame_noise.rng(), faults=faults)
         if output is not None:
             files.write_exposure_fits(output, simulator, exposure, frame_noise)
@@ -116,7 +118,8 @@ def simulate(
             "written": [str(path) for path in targets],
             "gl_renderer": simulator.renderer.gl_renderer,
         }
-    dn, named = summary["dn"], f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
+    dn = summary["dn"]
+    named = f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
     line = (
         f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote"
         f" {', '.join(summary['written'])}"
@@ -149,7 +152,10 @@ def simulate_log(
         say(line)
     max_rate_rad_s = math.radians(config.attitude.max_rate_deg_s)
     views = log_views(samples, frames, config.tracker.exposure_s, max_rate_rad_s)
-    faults = None if wrong is None else LogFaults(wrong, samples, max_rate_rad_s)
+    if wrong is None:
+        faults = None
+    else:
+        faults = LogFaults(wrong, samples, max_rate_rad_s)
     with progress("exposing", len(views)) as advance:
         simulate_views(file, views, noise, output, advance, faults)
     typer.echo(f"{len(views)} exposures in {output}")

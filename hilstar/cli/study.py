@@ -96,22 +96,26 @@ def study(
             from hilstar.instruments.study.confront import run as confront_set
 
             make_directory(output)
-            lines, right = confront_set(output, images, quick), None
+            lines = confront_set(output, images, quick)
+            right = None
         elif bench is None:
             lines, right = study_lines(what, output, quick)
         elif what == "chain":
             chain = chain_study(bench, output, quick, advance)
-            lines, right, answers = chain.lines, chain.right, chain.answers
+            lines = chain.lines
+            right = chain.right
+            answers = chain.answers
         else:
-            lines, right = thesis_lines(what, bench, output, place), True
-    told = {
+            lines = thesis_lines(what, bench, output, place)
+            right = True
+    fields = {
         "study": what,
         "right": right,
         "findings": lines,
         "answers": answers,
         "directory": str(output),
     }
-    print_found(as_json, told, [*lines, f"figures and tables in {output}", *answers])
+    print_found(as_json, fields, [*lines, f"figures and tables in {output}", *answers])
 
 
 def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path | None) -> None:

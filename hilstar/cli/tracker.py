@@ -170,12 +170,14 @@ def tracker(
     bias_arcsec = options.parse_numbers(bias, 3, "--bias", "X,Y,Z in arcsec")
     if max(map(abs, bias_arcsec)) > MAX_ARCSEC:
         raise InputError(f"--bias {bias}: write at most {MAX_ARCSEC:g} arcsec")
-    repeating, silence = (fov_error, pixel_error), parse_silent(silent)
+    repeating = (fov_error, pixel_error)
+    silence = parse_silent(silent)
     share = options.parse_share(wrong, "--wrong")
     errors = Planted(
         tuple(bias_arcsec), *repeating, share, *silence, latency, clock_drift, clock_offset
     )
-    rate_hz, stop = checked_rate(rate, file.config.tracker.exposure_s), threading.Event()
+    rate_hz = checked_rate(rate, file.config.tracker.exposure_s)
+    stop = threading.Event()
     noise, chance, garbage = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))
     with (
         FrameWatch(watch) as frames,
@@ -202,8 +204,8 @@ def tracker(
 
         seconds = float("inf") if duration is None else duration
         process.run(None if link is None else send, stop, seconds)
-        told = process.tally.summary() | counts_of(live, frames, link, gige)
-    tell(told, as_json)
+        summary = process.tally.summary() | counts_of(live, frames, link, gige)
+    tell(summary, as_json)
 
 
 def counts_of(
@@ -227,7 +229,8 @@ def counts_of(
             "babbled": link.babbled,
         }
     if gige is not None:
-        sent, heard = gige.counts, gige.channel.counts
+        sent = gige.counts
+        heard = gige.channel.counts
         counts["camera"] = dataclasses.asdict(sent) | dataclasses.asdict(heard)
     return counts
 
@@ -291,7 +294,8 @@ def tell(told: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(told)
         return
-    cpu, latency = told["cpu_ms"], told["latency_ms"]
+    cpu = told["cpu_ms"]
+    latency = told["latency_ms"]
     modes = ", ".join(f"{count} {mode}" for mode, count in told["modes"].items()) or "none"
     typer.echo(
         f"{'answers':20}{told['answers']}, {told['valid']} valid ({modes}), {told['passed_over']}"
@@ -361,7 +365,8 @@ def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
             )
             return None
     if text in {None, "tetra3"}:
-        camera, stars = live.camera, live.stars
+        camera = live.camera
+        stars = live.stars
         vectors = stars.directions(np.arange(len(stars.rates_e_per_s)))
         database = LostInSpace(
             vectors, stars.v_mag[: len(vectors)], camera.focal_length_px, camera.resolution_px
@@ -385,7 +390,8 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
             " true attitude"
         )
     solver = choose_solver(text, Centroiding(), live.file.folder, SOLVER_S)
-    nowhere, told = View(np.array([1.0, 0.0, 0.0, 0.0])), set[str]()
+    nowhere = View(np.array([1.0, 0.0, 0.0, 0.0]))
+    told_kinds = set[str]()
 
     def solve(found: Any, dn: Any) -> Any:
         try:
@@ -393,9 +399,9 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
                 Exposure(nowhere, dn, np.zeros((0, 0)), np.zeros(0, dtype=EXPOSURE_DTYPE)), live
             ).q_icrs_to_cam
         except SolverFault as fault:
-            if str(fault) not in told:
+            if str(fault) not in told_kinds:
                 say(f"hilstar: {fault}")
-                told.add(str(fault))
+                told_kinds.add(str(fault))
             return None
 
     return solve
@@ -412,7 +418,10 @@ def recorded(path: Path | None) -> Iterator[Any]:
 
         def row(said: "Answer") -> None:
             q = said.q_icrs_to_cam
-            numbers = ",,," if q is None else ",".join(repr(float(value)) for value in q)
+            if q is None:
+                numbers = ",,,"
+            else:
+                numbers = ",".join(repr(float(value)) for value in q)
             file.write(f"{(said.t_ns or 0) / 1e9:.9f},{numbers},{int(q is not None)}\n")
 
         yield row

@@ -92,13 +92,14 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
     lines = []
     for pair in pairs:
         first, second = pair["heads"]
-        linear, codes = pair["linear_arcsec"], pair["codes_arcsec"]
-        told = "too few stars in both"
+        linear = pair["linear_arcsec"]
+        codes = pair["codes_arcsec"]
+        agreement = "too few stars in both"
         if linear is not None and codes is not None:
-            told = (
+            agreement = (
                 f"{linear['rms']:.4f} / {linear['max']:.4f} arcsec from linear light,"
                 f" {codes['rms']:.4f} / {codes['max']:.4f} from codes (rms / max, {pair['fields']}"
                 " fields)"
             )
-        lines.append(f"{f'{first} to {second}':20}{told}")
+        lines.append(f"{f'{first} to {second}':20}{agreement}")
     print_found(as_json, {"angles": pairs}, lines)

@@ -87,7 +87,8 @@ class Balance:
         """The part that is in a box of `side` tracker pixels of a pixel so many pixels from a
         star's nearest.
         """
-        half, ends = side * self.seen.pixel_px / 2, range(BOX_REACH + 1)
+        half = side * self.seen.pixel_px / 2
+        ends = range(BOX_REACH + 1)
         # A box without blur keeps an edge of half a pixel: where the tracker's pixels lie on the
         # monitor's is not known.
         blur = max(self.seen.blur_px, 0.25)

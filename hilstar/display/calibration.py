@@ -104,10 +104,10 @@ def weights_of_grid(pixels: int, fields: int) -> FloatArray:
     if fields == 1:
         return np.ones((pixels, 1))
     place = (np.arange(pixels) + 0.5) * fields / pixels - 0.5
-    left = np.clip(np.floor(place).astype(np.intp), 0, fields - 2)
+    lower_node = np.clip(np.floor(place).astype(np.intp), 0, fields - 2)
     weights = np.zeros((pixels, fields))
-    weights[np.arange(pixels), left] = 1 - (place - left)
-    weights[np.arange(pixels), left + 1] = place - left
+    weights[np.arange(pixels), lower_node] = 1 - (place - lower_node)
+    weights[np.arange(pixels), lower_node + 1] = place - lower_node
     return weights
 
 
@@ -123,11 +123,10 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     name = str(source)
     if name in FORMULAS:
         grey = _formula(name, bits)
-        response = (
-            responses.bit_stealing_response((grey, grey, grey), REC709_WEIGHTS)
-            if bit_stealing
-            else grey
-        )
+        if bit_stealing:
+            response = responses.bit_stealing_response((grey, grey, grey), REC709_WEIGHTS)
+        else:
+            response = grey
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
         return Calibration(
             name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula"
@@ -151,7 +150,10 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     uniformity = None
     if file.uniformity is not None:
         uniformity = read_grid(beside(path, file.uniformity.file, "[uniformity] file"), read)
-    weights = (file.weights.r, file.weights.g, file.weights.b) if file.weights else None
+    if file.weights:
+        weights = (file.weights.r, file.weights.g, file.weights.b)
+    else:
+        weights = None
     response, shares = _response(path, bits, columns, weights, bit_stealing)
     return Calibration(
         name=name if name == "lcd-example" else path.name,
@@ -170,11 +172,15 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
 
 
 def _formula(name: str, bits: int) -> responses.Response:
-    return responses.srgb_response(bits) if name == "srgb" else responses.gamma_response(bits)
+    if name == "srgb":
+        return responses.srgb_response(bits)
+    return responses.gamma_response(bits)
 
 
 def _path_of(source: str | Path) -> Path:
-    return EXAMPLE if str(source) == "lcd-example" else Path(source)
+    if str(source) == "lcd-example":
+        return EXAMPLE
+    return Path(source)
 
 
 def primary_lights(source: str | Path, bits: int) -> FloatArray:
@@ -197,7 +203,10 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
             f"{path}: the primaries as the tracker sees them are not known; add [weights] r, g, b"
         )
     shares = np.array([file.weights.r, file.weights.g, file.weights.b])
-    names = ("r", "g", "b") if "r" in above else ("w", "w", "w")
+    if "r" in above:
+        names = ("r", "g", "b")
+    else:
+        names = ("w", "w", "w")
     light = np.stack([above[name] / above[name][-1] for name in names])
     return np.asarray(light * (shares / shares.sum())[:, None])
 
@@ -237,12 +246,17 @@ def with_uniformity(
     `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's;
     `relative` is the standard error of a field. Raises InputError.
     """
-    response, weights, noise, notes, errors = f"{path.stem}.csv", None, 0.0, NotesTable(), None
+    response = f"{path.stem}.csv"
+    weights = None
+    noise = 0.0
+    notes = NotesTable()
+    errors = None
     if str(source) in FORMULAS:
         head = CalibrationHead(
             "photometric", "", when, f"none: the formula {source}", "relative", bits, response
         )
-        columns, weights = {"w": _formula(str(source), bits).light}, WeightsTable(*REC709_WEIGHTS)
+        columns = {"w": _formula(str(source), bits).light}
+        weights = WeightsTable(*REC709_WEIGHTS)
     else:
         origin = _path_of(source)
         file = read_toml(origin)
@@ -250,12 +264,17 @@ def with_uniformity(
             beside(origin, file.calibration.response, "[calibration] response"), bits
         )
         head = msgspec.structs.replace(file.calibration, response=response)
-        weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
-        identity, errors = identity or file.monitor_identity, file.errors
+        weights = file.weights
+        noise = file.noise.relative if file.noise else 0.0
+        notes = file.notes
+        identity = identity or file.monitor_identity
+        errors = file.errors
     table = write_calibration(
         path, head, columns, noise, notes, weights, identity=identity, errors=errors
     )
-    return (path, table) if grid is None else (path, table, add_uniformity(path, grid, relative))
+    if grid is None:
+        return (path, table)
+    return (path, table, add_uniformity(path, grid, relative))
 
 
 def _response(
@@ -445,7 +464,8 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
             f"{path}: its header is {','.join(header)[:60]!r}; write code,w or code,r,g,b"
         )
     rows = _numbers(table, [needed(table, name) for name in header])
-    code, white = rows[:, 0], 2**bits - 1
+    code = rows[:, 0]
+    white = 2**bits - 1
     if np.any(code != np.rint(code)) or np.any(np.diff(code) <= 0):
         raise InputError(
             f"{path}: its codes are not whole numbers that rise; sort the rows, one to a code"
@@ -476,7 +496,8 @@ def _every_code(
     """
     fall = np.flatnonzero(np.diff(light) <= 0)
     if len(fall):
-        low, high = code[fall[0]], code[fall[0] + 1]
+        low = code[fall[0]]
+        high = code[fall[0] + 1]
         raise InputError(
             f"{path}: light of channel {name} does not rise from code {low:g} to code {high:g};"
             " every code must be brighter"
@@ -485,7 +506,8 @@ def _every_code(
         return light
     if len(code) < 3:
         raise InputError(f"{path}: two codes make no response; give some between black and white")
-    log_code, log_light = np.log(code[1:]), np.log(light[1:] - light[0])
+    log_code = np.log(code[1:])
+    log_light = np.log(light[1:] - light[0])
     # a quarter of a second of every command that has no such file
     from scipy.interpolate import PchipInterpolator
 
@@ -567,6 +589,9 @@ def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) 
         table, "".join(",".join(f"{value!r}" for value in row) + "\n" for row in grid.tolist())
     )
     text = read_text(path, ADVICE, MAX_TOML_BYTES)
-    known = "" if relative is None else f"relative = {relative:.4g}\n"
+    if relative is None:
+        known = ""
+    else:
+        known = f"relative = {relative:.4g}\n"
     write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n{known}")
     return table

@@ -154,8 +154,14 @@ class ExactQuantiser(quantise.Quantiser):
     def cost(cls, psf: Psf, gl_version: int) -> quantise.LevelCost:
         """The cost of the shader, or of NumPy where the shader cannot draw."""
         has_compute = gl_version >= COMPUTE_VERSION
-        by_numpy_ms = NUMPY_EXACT_MS_A_STAR if _fits(psf) else WIDE_EXACT_MS_A_STAR
-        why = "" if has_compute else "in NumPy: its compute shaders need OpenGL 4.3"
+        if _fits(psf):
+            by_numpy_ms = NUMPY_EXACT_MS_A_STAR
+        else:
+            by_numpy_ms = WIDE_EXACT_MS_A_STAR
+        if has_compute:
+            why = ""
+        else:
+            why = "in NumPy: its compute shaders need OpenGL 4.3"
         return quantise.LevelCost(
             EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why
         )
@@ -189,18 +195,20 @@ class ExactQuantiser(quantise.Quantiser):
         self._on_floor = floor is not None
         self._lit = np.empty(0, dtype=np.int32)
         if sprites is not None and len(sprites):
-            found = self._map.find(sprites)
-            levels = np.empty(found.place.shape, dtype=self._flat.dtype)
+            footprint = self._map.find(sprites)
+            levels = np.empty(footprint.place.shape, dtype=self._flat.dtype)
             carried = self._carried(sprites)
-            left = np.empty_like(carried.error)
-            reach = self._reach(found.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32))
+            remainder = np.empty_like(carried.error)
+            reach = self._reach(
+                footprint.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32)
+            )
             for some in _turns(sprites):
-                levels[:, some], left[:, some] = self._choose(
-                    _part(found, some), carried.of(some), reach[some]
+                levels[:, some], remainder[:, some] = self._choose(
+                    _part(footprint, some), carried.of(some), reach[some]
                 )
-                _hand_on(carried.error, left, some, sprites)
-            self._keep(sprites, left)
-            self._lit = found.place.ravel()
+                _hand_on(carried.error, remainder, some, sprites)
+            self._keep(sprites, remainder)
+            self._lit = footprint.place.ravel()
             self._flat[self._lit] = levels.ravel()
             self._flat[-1] = 0
         return Levels(self._flat[:-1].reshape(height, width))
@@ -243,11 +251,9 @@ class ExactQuantiser(quantise.Quantiser):
         near = self._map.order.near
         lower, upper, short, step = self._levels_about(found)
         chosen = np.arange(near)[:, None] < reach
-        far, short, step = (
-            short.copy(),
-            np.where(chosen, short[:near], np.float32(0)),
-            np.where(chosen, step, np.float32(0)),
-        )
+        far = short.copy()
+        short = np.where(chosen, short[:near], np.float32(0))
+        step = np.where(chosen, step, np.float32(0))
         far[:near][chosen] = 0.0
         d = found.offset_px - found.fraction_px[:, None]
         weights = self._balance.weights
@@ -260,19 +266,21 @@ class ExactQuantiser(quantise.Quantiser):
         error[:3] += np.stack([far.sum(axis=0), *np.einsum("kpn,pn->kn", d, far)])
         # Where all steps of a star are equal: the step; 0 elsewhere. What lies between two of them
         # no choice can show.
-        largest, smallest = step.max(axis=0), np.min(step, axis=0, initial=np.inf, where=step > 0)
+        largest = step.max(axis=0)
+        smallest = np.min(step, axis=0, initial=np.inf, where=step > 0)
         grid = np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
         error[0] += carried.phase * grid
-        lowest, unit = short.sum(axis=0) + error[0], np.where(grid > 0, grid, np.float32(1))
+        lowest = short.sum(axis=0) + error[0]
+        unit = np.where(grid > 0, grid, np.float32(1))
         hidden = np.where(grid > 0, lowest - np.rint(lowest / unit) * unit, np.float32(0))
         error[0] -= hidden
         weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(weights.moments))])
         error[:3] *= weight
-        up, left = _decide(short, step, arm, error, weights.last_light, self.kept)
-        _turn_one_more(step, arm, up, left, grid)
-        left[:3] /= weight
-        left[0] += hidden
-        return np.concatenate([lower + up, upper]), left
+        up, remainder = _decide(short, step, arm, error, weights.last_light, self.kept)
+        _turn_one_more(step, arm, up, remainder, grid)
+        remainder[:3] /= weight
+        remainder[0] += hidden
+        return np.concatenate([lower + up, upper]), remainder
 
     def _levels_about(
         self, found: Footprints
@@ -282,7 +290,10 @@ class ExactQuantiser(quantise.Quantiser):
         in steps from black.
         """
         near = self._map.order.near
-        output = None if self._output is None else self._output[found.place]
+        if self._output is None:
+            output = None
+        else:
+            output = self._output[found.place]
         asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
         if output is not None:
             asked /= output
@@ -291,7 +302,8 @@ class ExactQuantiser(quantise.Quantiser):
         # light over white is lost; neighbours do not make up for it
         np.minimum(asked, np.float32(1), out=asked)
         # The nearest level this far out is 0 for all but the brightest stars.
-        lower, upper = self._lower.count(asked[:near]), np.zeros(asked[near:].shape, dtype=np.intp)
+        lower = self._lower.count(asked[:near])
+        upper = np.zeros(asked[near:].shape, dtype=np.intp)
         bright = asked[near:] >= self._first_threshold
         upper[bright] = self._nearest.count(asked[near:][bright])
         shown = self._light[np.concatenate([lower, upper])]
@@ -326,7 +338,8 @@ def _turns(sprites: FrameLight) -> Iterator[IntArray]:
         place = (place - np.repeat(begins, np.diff(begins, append=len(sprites)))) % CARRIED
         order = np.argsort(place, kind="stable")
     else:
-        order, place = place, np.zeros_like(place)
+        order = place
+        place = np.zeros_like(place)
     for turn in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
         for start in range(0, len(turn), CHUNK):
             yield turn[start : start + CHUNK]
@@ -373,30 +386,34 @@ def _decide(
     light counts `last_light` times at the end.
     """
     near, count = step.shape
-    kept = np.repeat(error[:, None], choices, axis=1)
+    carried = np.repeat(error[:, None], choices, axis=1)
     up = np.zeros((near, choices, count), dtype=np.bool_)
     missing = np.zeros((choices, count), dtype=np.float32)
     missing[1:] = NONE
     for pixel in range(near):
-        weight, by = arm[:, pixel, None], step[pixel]
-        kept += weight * short[pixel]
-        down = np.square(kept).sum(axis=0) + missing
-        rise = by * (2 * (weight * kept).sum(axis=0) + by * np.square(weight).sum(axis=0))
+        weight = arm[:, pixel, None]
+        by = step[pixel]
+        carried += weight * short[pixel]
+        down = np.square(carried).sum(axis=0) + missing
+        rise = by * (2 * (weight * carried).sum(axis=0) + by * np.square(weight).sum(axis=0))
         rise[:, by == 0] = NONE
         # Of the four choices that two of those kept lead to keep two, in their places. Where both
         # of one lead to less than either of the other, the other's place takes the second.
         other = np.arange(choices) ^ (1 << (pixel % (choices.bit_length() - 1)))
-        better, worse = down + np.minimum(rise, 0), down + np.maximum(rise, 0)
+        better = down + np.minimum(rise, 0)
+        worse = down + np.maximum(rise, 0)
         taken = worse[other] < better
         place, star = np.nonzero(taken)
-        kept[:, place, star] = kept[:, other[place], star]
+        carried[:, place, star] = carried[:, other[place], star]
         up[:pixel, place, star] = up[:pixel, other[place], star]
         missing[place, star] = missing[other[place], star]
         up[pixel] = np.where(taken, rise[other] >= 0, rise < 0)
-        kept += weight * by * up[pixel]
-    heavier = (last_light**2 - 1) * np.square(kept[0])
-    best = (np.square(kept).sum(axis=0) + heavier + missing).argmin(axis=0)[None, None]
-    return np.take_along_axis(up, best, axis=1)[:, 0], np.take_along_axis(kept, best, axis=1)[:, 0]
+        carried += weight * by * up[pixel]
+    heavier = (last_light**2 - 1) * np.square(carried[0])
+    best = (np.square(carried).sum(axis=0) + heavier + missing).argmin(axis=0)[None, None]
+    return np.take_along_axis(up, best, axis=1)[:, 0], np.take_along_axis(carried, best, axis=1)[
+        :, 0
+    ]
 
 
 def _turn_one_more(

@@ -46,7 +46,8 @@ class PixelOrder:
         self.first = -((self.size - 1) // 2)
         self.bias = 0.5 if self.size % 2 else 0.0
         spread_px = np.sqrt(psf.variance_px2)
-        phase, steps = self._middles, np.arange(self.size) + self.first
+        phase = self._middles
+        steps = np.arange(self.size) + self.first
         x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread_px)
         # The footprint's pixels from a star of each phase, in sigmas
         distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(
@@ -132,7 +133,8 @@ class FootprintMap:
             raise InputError(
                 f"sprites of {sprites.footprint_px} px where the PSF needs {order.size} px"
             )
-        data, count = sprites.data, len(sprites)
+        data = sprites.data
+        count = len(sprites)
         fraction = data["fraction_px"].astype(np.float64).T
         cell = np.clip((fraction + order.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
         row, column = (
@@ -158,7 +160,8 @@ class FootprintMap:
 
     def _places(self, pixel: PlaceArray, row: PlaceArray, column: PlaceArray) -> PlaceArray:
         width, height = self.resolution_px
-        x, y = pixel[:, 0].astype(np.int32), pixel[:, 1].astype(np.int32)
+        x = pixel[:, 0].astype(np.int32)
+        y = pixel[:, 1].astype(np.int32)
         place = row * width + column
         place += y * width + x
         reach = self.order.size
@@ -166,7 +169,8 @@ class FootprintMap:
             (x < reach) | (x >= width - reach) | (y < reach) | (y >= height - reach)
         )
         if len(cut):
-            at_x, at_y = x[cut] + column[:, cut], y[cut] + row[:, cut]
+            at_x = x[cut] + column[:, cut]
+            at_y = y[cut] + row[:, cut]
             inside = (at_x >= 0) & (at_x < width) & (at_y >= 0) & (at_y < height)
             place[:, cut] = np.where(inside, place[:, cut], self.pixels)
         return place
@@ -175,7 +179,8 @@ class FootprintMap:
         """Assign each pixel that several stars touch to the brightest there, with the light of
         all.
         """
-        flat_light, flat_place = light.ravel(), place.ravel()
+        flat_light = light.ravel()
+        flat_place = place.ravel()
         entry = np.arange(flat_place.size, dtype=np.int32)
         self._last_entry[flat_place] = entry  # the last of several stays
         beaten = (self._last_entry[flat_place] != entry) & (flat_place != self.pixels)
@@ -205,22 +210,22 @@ def star_losses_mag(
     counts for the brightest there, with the light of all. A star without a pixel of its own loses,
     in each of its pixels, the share that the pixel's owner loses.
     """
-    found = footprints.find(sprites)
-    wanted = found.light.sum(axis=0, dtype=np.float64)
-    shown = _shown(found.place, panel, levels).sum(axis=0)
+    star_light = footprints.find(sprites)
+    wanted = star_light.light.sum(axis=0, dtype=np.float64)
+    shown = _shown(star_light.place, panel, levels).sum(axis=0)
     hidden = np.flatnonzero(wanted == 0)
     if len(hidden):
         whole = np.bincount(
-            found.place.ravel(), found.light.ravel(), minlength=footprints.pixels + 1
+            star_light.place.ravel(), star_light.light.ravel(), minlength=footprints.pixels + 1
         )
     for k in hidden.tolist():
-        spectra = (
-            sprites.spectra
-            if sprites.spectra is None or sprites.spectra.ndim == 1
-            else sprites.spectra[k : k + 1]
-        )
+        if sprites.spectra is None or sprites.spectra.ndim == 1:
+            spectra = sprites.spectra
+        else:
+            spectra = sprites.spectra[k : k + 1]
         alone = footprints.find(replace(sprites, data=sprites.data[k : k + 1], spectra=spectra))
-        place, light = alone.place[:, 0], alone.light[:, 0].astype(np.float64)
+        place = alone.place[:, 0]
+        light = alone.light[:, 0].astype(np.float64)
         lit = light > 0
         wanted[k] = light.sum()
         shown[k] = (light[lit] * _shown(place[lit], panel, levels) / whole[place[lit]]).sum()
@@ -231,7 +236,10 @@ def star_losses_mag(
 def _shown(place: PlaceArray, panel: Panel, levels: Levels) -> FloatArray:
     if levels.ndim == 3:
         return np.asarray(
-            sum(_shown(place, one, Levels(levels[..., k])) for k, one in enumerate(panel.primaries))
+            sum(
+                _shown(place, primary, Levels(levels[..., k]))
+                for k, primary in enumerate(panel.primaries)
+            )
         )
     level = np.append(levels.ravel(), levels.dtype.type(0))[place]
     share = np.asarray(panel.response.light[level], dtype=np.float64)

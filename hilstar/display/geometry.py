@@ -71,7 +71,9 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     alignment_dof: float | None = None
 
     def __post_init__(self) -> None:
-        rows, modes, turn = self.map_arcsec, self.modes_arcsec, self.alignment_covariance_arcsec2
+        rows = self.map_arcsec
+        modes = self.modes_arcsec
+        turn = self.alignment_covariance_arcsec2
         if rows is not None and (not rows or len({len(row) for row in rows}) != 1):
             raise ValueError("map_arcsec has rows of different lengths")
         if modes is not None and (
@@ -137,20 +139,21 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
     """The camera of a geometry file for a monitor of `resolution_px`. Raises InputError."""
-    found: GeometryFile = _read(path, GeometryFile, ADVICE)
-    if found.kind != KIND:
+    geometry: GeometryFile = _read(path, GeometryFile, ADVICE)
+    if geometry.kind != KIND:
         raise InputError(
-            f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}"
+            f"{path}: kind = {shortened(repr(geometry.kind))} and {KIND!r} is wanted; {ADVICE}"
         )
-    if found.resolution_px != resolution_px:
+    if geometry.resolution_px != resolution_px:
         sizes = "{} x {} px and the bench file's monitor has {} x {}".format(
-            *found.resolution_px, *resolution_px
+            *geometry.resolution_px, *resolution_px
         )
         raise InputError(f"{path}: is of a monitor of {sizes}; calibrate this monitor")
-    q = np.array(found.q_cam_to_mon)
+    q = np.array(geometry.q_cam_to_mon)
     if not abs(float(np.linalg.norm(q)) - 1.0) <= NORM_TOLERANCE:
         raise InputError(f"{path}: q_cam_to_mon: its norm is {np.linalg.norm(q):.6g}; {ADVICE}")
-    field, residual = found.field, None
+    field = geometry.field
+    residual = None
     if field is not None:
         sides = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
         if len(sides) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
@@ -158,18 +161,20 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
                 f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}"
             )
         residual = ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
-    a, b = found.tilt_deg
+    a, b = geometry.tilt_deg
     lens = Lens(
-        (found.k1, found.k2, found.k3),
-        (found.p1, found.p2),
+        (geometry.k1, geometry.k2, geometry.k3),
+        (geometry.p1, geometry.p2),
         (float(np.radians(a)), float(np.radians(b))),
         residual,
-        math.inf if found.max_field_deg is None else math.tan(math.radians(found.max_field_deg)),
+        math.inf
+        if geometry.max_field_deg is None
+        else math.tan(math.radians(geometry.max_field_deg)),
     )
     return Camera(
         resolution_px,
-        found.focal_length_px,
-        found.principal_point_px,
+        geometry.focal_length_px,
+        geometry.principal_point_px,
         to_matrix(normalise(q)),
         lens,
     )
@@ -177,9 +182,12 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
 
 def load_notes(path: Path) -> Notes:
     """The notes of a geometry file. Raises InputError."""
-    found: GeometryFile = _read(path, GeometryFile, ADVICE)
+    geometry: GeometryFile = _read(path, GeometryFile, ADVICE)
     return Notes(
-        found.sigma, found.error or ErrorTable(), found.made or MadeTable(), found.monitor_identity
+        geometry.sigma,
+        geometry.error or ErrorTable(),
+        geometry.made or MadeTable(),
+        geometry.monitor_identity,
     )
 
 
@@ -200,8 +208,11 @@ class DistortionFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only
 def load_distortion(path: Path, camera: Camera) -> Camera:
     """The camera of a tracker with the lens of its flight model. Raises InputError."""
     advice = "write k1, k2, k3, p1 and p2, numbers, as far as they are not 0"
-    found: DistortionFile = _read(path, DistortionFile, advice)
-    return replace(camera, lens=Lens((found.k1, found.k2, found.k3), (found.p1, found.p2)))
+    distortion: DistortionFile = _read(path, DistortionFile, advice)
+    return replace(
+        camera,
+        lens=Lens((distortion.k1, distortion.k2, distortion.k3), (distortion.p1, distortion.p2)),
+    )
 
 
 def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: Notes) -> None:
@@ -216,7 +227,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     coefficients: dict[str, Any] = dict(
         zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True)
     )
-    found = GeometryFile(
+    geometry = GeometryFile(
         kind=KIND,
         resolution_px=camera.resolution_px,
         focal_length_px=camera.focal_length_px,
@@ -232,7 +243,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         error=notes.error,
         made=notes.made,
     )
-    table = msgspec.to_builtins(found) | {
+    table = msgspec.to_builtins(geometry) | {
         TABLE: None if notes.identity is None else notes.identity.known()
     }
     write_whole(path, toml_text(table))

@@ -82,13 +82,13 @@ class MonitorIdentity(Table, frozen=True):
 
     def name(self) -> str:
         """The monitor and its connection for a person."""
-        own = (
+        monitor_name = (
             " ".join(part for part in (self.maker, self.model) if part)
             or "a monitor that does not say what it is"
         )
-        own += f", serial {self.serial}" if self.serial else ""
+        monitor_name += f", serial {self.serial}" if self.serial else ""
         return (
-            f"{own}, on {self.connector or 'a connector not known'} at"
+            f"{monitor_name}, on {self.connector or 'a connector not known'} at"
             f" {self.mode or 'a mode not known'}"
         )
 
@@ -102,7 +102,10 @@ class MonitorIdentity(Table, frozen=True):
                 f"{self.maker} {self.model} has no serial number: another one of its kind on"
                 f" {self.connector} passes for it"
             )
-        why = "EDID unreadable" if self.edid_sha256 else "no EDID"
+        if self.edid_sha256:
+            why = "EDID unreadable"
+        else:
+            why = "no EDID"
         return f"{why}: the monitor is told apart by connector and mode alone"
 
     def known(self) -> dict[str, Any]:
@@ -124,19 +127,22 @@ def edid_identity(edid: bytes) -> MonitorIdentity:
     from pyedid import parse_edid  # 0.1 s, with the HTTP library that it imports
 
     try:
-        found = parse_edid(edid)
+        edid_fields = parse_edid(edid)
     except (ValueError, struct.error):
         return known
     # pyedid 1.0.3 reads these two numbers the wrong way round.
     product, number = (int.from_bytes(edid[a:b], "little") for a, b in ((10, 12), (12, 16)))
-    text_serial = _plain(found.serial) if isinstance(found.serial, str) else ""
+    if isinstance(edid_fields.serial, str):
+        text_serial = _plain(edid_fields.serial)
+    else:
+        text_serial = ""
     return msgspec.structs.replace(
         known,
-        maker=found.manufacturer_pnp_id,
-        model=_plain(found.name or "") or f"{product:04x}",
+        maker=edid_fields.manufacturer_pnp_id,
+        model=_plain(edid_fields.name or "") or f"{product:04x}",
         serial=_stated_serial(text_serial) or _stated_serial(str(number)),
-        week=found.week if 0 < found.week <= MAX_WEEK else None,
-        year=found.year,
+        week=edid_fields.week if 0 < edid_fields.week <= MAX_WEEK else None,
+        year=edid_fields.year,
     )
 
 
@@ -224,12 +230,13 @@ def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
         "contrast",
         "colour_preset",
     ):
-        before, after = getattr(was, key), getattr(now, key)
+        before = getattr(was, key)
+        after = getattr(now, key)
         if before not in ("", None) and after not in ("", None) and before != after:
             yield (
                 f"{key.replace('_', ' ')} {str(before)[:SHOWN_DIGITS]}, now"
                 f" {str(after)[:SHOWN_DIGITS]}"
             )
     if was.window_system != now.window_system:
-        before, after = (", ".join(one.window_system) or "nothing" for one in (was, now))
+        before, after = (", ".join(identity.window_system) or "nothing" for identity in (was, now))
         yield f"the window system added {before}, and adds {after} now"

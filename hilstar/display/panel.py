@@ -40,7 +40,9 @@ class Panel:
 
         A product and not a quotient: of the two only the product is rounded the same by every GL.
         """
-        return None if self.uniformity is None else np.reciprocal(self.uniformity, dtype=np.float32)
+        if self.uniformity is None:
+            return None
+        return np.reciprocal(self.uniformity, dtype=np.float32)
 
     def light_e_per_s(self) -> Float32Array:
         """The light of each level in the unit of the linear image, float32 (levels,)."""

@@ -46,7 +46,8 @@ def phase_grid(
 
     The first phase along x and y is `first`, in steps of 1 / count px.
     """
-    tile, steps = psf.footprint_px + MARGIN_PX, np.arange(count)
+    tile = psf.footprint_px + MARGIN_PX
+    steps = np.arange(count)
     places = ((steps + 0.5) * tile + (steps + start) / count - 0.5 for start in first)
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(*places))
     flux = np.full(count**2, WHITE / psf.peak_share)
@@ -67,9 +68,13 @@ def phase_image(sprites: FrameLight, psf: Psf, tile_px: int | None = None) -> Fl
     and rows of tiles of `tile_px`, by default those of `phase_grid`.
     """
     count = math.isqrt(len(sprites))
-    tile = sprites.footprint_px + MARGIN_PX if tile_px is None else tile_px
+    if tile_px is None:
+        tile = sprites.footprint_px + MARGIN_PX
+    else:
+        tile = tile_px
     at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
-    pixels, offsets = [], []
+    pixels = []
+    offsets = []
     for axis, places in enumerate(line_places(sprites)):
         line = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
         pixels.append(line.ravel())
@@ -102,7 +107,8 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
     count = len(image) // tile
     tiles = image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3)
     light = tiles.sum(axis=(2, 3))
-    at, divisor = np.arange(tile), np.where(light > 0, light, 1.0)
+    at = np.arange(tile)
+    divisor = np.where(light > 0, light, 1.0)
     return light, tiles.sum(axis=2) @ at / divisor, tiles.sum(axis=3) @ at / divisor
 
 
@@ -125,5 +131,7 @@ def shown_by(
         quantiser.draw(UnquantisedFrame(sprites, lambda: linear, lambda: linear, number))
         for number in range(exposed.stop)
     )
-    shown = (shown_light(each, panel) for each in islice(levels, exposed.start, None))
+    shown = (
+        shown_light(frame_levels, panel) for frame_levels in islice(levels, exposed.start, None)
+    )
     return np.asarray(sum(shown) / len(exposed))

@@ -99,7 +99,7 @@ def read_primaries(path: Path) -> tuple[Curve, ...]:
 def _curves(nm: FloatArray, power: FloatArray) -> tuple[Curve, ...]:
     first, last = np.nextafter(nm[[0, -1]], [0.0, np.inf])  # knots beside both ends and far off
     knots = np.concatenate([[RANGE_NM[0], first], nm, [last, RANGE_NM[1]]])
-    return tuple(Curve(knots, np.pad(one, 2)) for one in power)
+    return tuple(Curve(knots, np.pad(channel_power, 2)) for channel_power in power)
 
 
 def read_ccss(path: Path) -> tuple[Curve, ...]:
@@ -120,7 +120,7 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
         )
     shape = samples[lit] / np.linalg.norm(samples[lit], axis=1, keepdims=True)
     together = shape @ shape.T
-    found = []
+    fits = []
     for three in map(list, itertools.combinations(range(len(lit)), 3)):
         gram = together[np.ix_(three, three)]
         if np.linalg.det(gram) > MIXED_WITHIN**4:
@@ -130,10 +130,10 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
                 - 2 * (by * together[:, three]).sum(axis=1)
                 + np.einsum("ni,ij,nj->n", by, gram, by)
             )
-            found.append(
+            fits.append(
                 (float(np.sqrt(max(off.max(), 0.0))), -float(power[lit[three]].sum()), three)
             )
-    worst = min(found, default=(1.0, 0.0, []))[0]
+    worst = min(fits, default=(1.0, 0.0, []))[0]
     if worst > MIXED_WITHIN:
         raise InputError(
             f"{path}: no three of its {len(lit)} samples are primaries of which the others are"
@@ -141,7 +141,7 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
             f" samples of several displays; {CCSS_ADVICE}"
         )
     _, _, three = min(
-        (one for one in found if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1]
+        (one for one in fits if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1]
     )
     size = np.linalg.norm(samples[lit], axis=1)
     drive = (
@@ -171,7 +171,8 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
             for line in head.splitlines()
             if len(words := shlex.split(line, comments=True)) == 2
         )
-        first, last = float(keys["SPECTRAL_START_NM"]), float(keys["SPECTRAL_END_NM"])
+        first = float(keys["SPECTRAL_START_NM"])
+        last = float(keys["SPECTRAL_END_NM"])
         nm = np.linspace(first, last, int(keys["SPECTRAL_BANDS"]))
         fields = names.split()
         spectral = [k for k, name in enumerate(fields) if name.startswith("SPEC_")]
@@ -200,8 +201,8 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
     matching = np.array([sum(t * _lobe(m, a, b) for t, m, a, b in lobes) for lobes in MATCHING])
     middles = np.arange(XY_NM[0], XY_NM[-1], 0.25)
     spectra = np.exp(-((XY_NM - middles[:, None]) ** 2) / 2 * (FWHM_SIGMAS / fwhm_nm) ** 2)
-    seen = spectra @ matching.T
-    seen_xy = (seen / seen.sum(axis=1, keepdims=True))[:, :2]
+    tristimulus = spectra @ matching.T
+    seen_xy = (tristimulus / tristimulus.sum(axis=1, keepdims=True))[:, :2]
     chosen = []
     for name, wanted in zip(PRIMARIES, xy, strict=True):
         off = np.hypot(*(seen_xy - wanted).T)
@@ -213,9 +214,10 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
                 f" {fwhm_nm:g} nm has [{near}]; write another width_nm, or measured spectra as file"
             )
     white = np.array([D65_XY[0], D65_XY[1], 1 - sum(D65_XY)]) / D65_XY[1]
-    amounts = (
-        np.linalg.solve(seen[chosen].T, white) if len(set(chosen)) == len(chosen) else np.zeros(3)
-    )
+    if len(set(chosen)) == len(chosen):
+        amounts = np.linalg.solve(tristimulus[chosen].T, white)
+    else:
+        amounts = np.zeros(3)
     if not (amounts > 0).all():
         raise InputError(
             "[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those"
@@ -231,9 +233,9 @@ def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
 
 def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
     """The longest wavelength at which a primary has `least` of its largest power."""
-    lit = [
-        curve.wavelength_nm[curve.value > least * curve.value.max()].max() for curve in primaries
-    ]
+    lit = []
+    for curve in primaries:
+        lit.append(curve.wavelength_nm[curve.value > least * curve.value.max()].max())
     return float(max(lit))
 
 
@@ -256,7 +258,10 @@ def channel_matrix(
             " in nm"
         )
     parted = np.linalg.matrix_rank(matrix) == min(matrix.shape)
-    condition = float(np.linalg.cond(matrix)) if parted else None
+    if parted:
+        condition = float(np.linalg.cond(matrix))
+    else:
+        condition = None
     return ChannelMatrix(tuple(channels), matrix * (white_e_per_s / matrix.sum()), condition)
 
 
@@ -275,19 +280,24 @@ def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = Fals
     without a negative part is the solution.
     """
     scale = np.trace(gram)
-    gram, wanted = gram / scale, wanted / scale
-    best, least = np.zeros_like(wanted), np.full(len(wanted), np.inf if whole else 0.0)
+    gram = gram / scale
+    wanted = wanted / scale
+    best = np.zeros_like(wanted)
+    least = np.full(len(wanted), np.inf if whole else 0.0)
     for size in range(1, len(gram) + 1):
         for parts in map(list, itertools.combinations(range(len(gram)), size)):
-            system, right = gram[np.ix_(parts, parts)], wanted[:, parts]
+            system = gram[np.ix_(parts, parts)]
+            right = wanted[:, parts]
             if whole:
                 system = np.block(
                     [[system, np.ones((size, 1))], [np.ones((1, size)), np.zeros((1, 1))]]
                 )
                 right = np.column_stack([right, np.ones(len(right))])
-            found = np.zeros_like(wanted)
-            found[:, parts] = (right @ np.linalg.pinv(system, rcond=SINGULAR).T)[:, :size]
-            cost = np.einsum("ni,ij,nj->n", found, gram, found) - 2 * (found * wanted).sum(axis=1)
-            better = (found.min(axis=1) >= 0) & (cost < least)
-            best[better], least[better] = found[better], cost[better]
+            mixtures = np.zeros_like(wanted)
+            mixtures[:, parts] = (right @ np.linalg.pinv(system, rcond=SINGULAR).T)[:, :size]
+            cost = np.einsum("ni,ij,nj->n", mixtures, gram, mixtures) - 2 * (mixtures * wanted).sum(
+                axis=1
+            )
+            better = (mixtures.min(axis=1) >= 0) & (cost < least)
+            best[better], least[better] = mixtures[better], cost[better]
     return best

@@ -224,12 +224,16 @@ class DitherQuantiser(PixelQuantiser):
 
 def level_dtype(response: Response) -> type[np.uint8] | type[np.uint16]:
     """uint8 up to 256 levels, uint16 beyond."""
-    return np.uint8 if len(response.light) <= 256 else np.uint16
+    if len(response.light) <= 256:
+        return np.uint8
+    return np.uint16
 
 
 def _wanted(linear_e_per_s: Float32Array, panel: Panel) -> Float32Array:
     gain = panel.gain()
-    return linear_e_per_s if gain is None else linear_e_per_s * gain
+    if gain is None:
+        return linear_e_per_s
+    return linear_e_per_s * gain
 
 
 def round_levels(linear_e_per_s: Float32Array, panel: Panel) -> Levels:
@@ -246,9 +250,12 @@ def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0
     The mean light over all thresholds of the mask is the wanted light within 1/8192 of a step of
     levels.
     """
-    light, white = panel.light_e_per_s(), panel.response.white
+    light = panel.light_e_per_s()
+    white = panel.response.white
     place = np.flatnonzero(linear_e_per_s)  # `np.nonzero` takes six times as long
-    wanted, gain, mask = linear_e_per_s.ravel()[place], panel.gain(), turned_mask(shift)
+    wanted = linear_e_per_s.ravel()[place]
+    gain = panel.gain()
+    mask = turned_mask(shift)
     if gain is not None:
         wanted = wanted * gain.ravel()[place]
     lower = ThresholdCounter(light[1:]).count(wanted)
@@ -285,7 +292,9 @@ def mask_turn(frame: int) -> float:
     The turns of each aligned block of 2^m frames divide [0, 1) evenly; after MASK_TURNS frames it
     begins again.
     """
-    place, turn, weight = frame % MASK_TURNS, 0.0, 0.5
+    place = frame % MASK_TURNS
+    turn = 0.0
+    weight = 0.5
     while place:
         turn += weight * (place & 1)
         place >>= 1
@@ -301,7 +310,8 @@ def shown_light(levels: Levels, panel: Panel) -> FloatArray:
     """
     if levels.ndim == 3:
         return np.asarray(sum(primary_lights(levels, panel)))
-    lit, light = lit_light(levels, panel), np.zeros(levels.shape)
+    lit = lit_light(levels, panel)
+    light = np.zeros(levels.shape)
     light.ravel()[lit.place] = lit.e_per_s
     return light
 
@@ -342,14 +352,14 @@ def primary_levels(levels: Levels, panel: Panel) -> list[tuple[Levels, Panel]]:
     """
     if levels.ndim == 2:
         return [(levels, panel)]
-    return [(Levels(levels[..., k]), one) for k, one in enumerate(panel.primaries)]
+    return [(Levels(levels[..., k]), primary) for k, primary in enumerate(panel.primaries)]
 
 
 def primary_lights(levels: Levels, panel: Panel) -> list[FloatArray]:
     """The light (height, width) of each primary of levels (height, width, 3); of levels (height,
     width) all light together.
     """
-    return [shown_light(*each) for each in primary_levels(levels, panel)]
+    return [shown_light(*primary_level) for primary_level in primary_levels(levels, panel)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,14 +380,14 @@ class CodeTable:
         Those are 1 << bin_shift where it has none, which no light reaches. Before the first bin
         there is an empty one, for all light below it. None where a bin has several thresholds.
         """
-        bits, none = self.threshold.view(np.uint32), np.uint32(1 << self.bin_shift)
-        place, lower = (
-            (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin,
-            bits & (none - 1),
-        )
+        bits = self.threshold.view(np.uint32)
+        none = np.uint32(1 << self.bin_shift)
+        place = (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin
+        lower = bits & (none - 1)
         # the first code of a later bin counts a threshold at its very edge
         asked = (lower > 0) | (place == 0)
-        place, lower = place[asked], lower[asked]
+        place = place[asked]
+        lower = lower[asked]
         if (place[1:] == place[:-1]).any():  # thresholds rise
             return None
         words = np.full(len(self.first_code), none)
@@ -397,11 +407,9 @@ def code_table(thresholds: Float32Array) -> CodeTable:
         _table(thresholds, MANTISSA_BITS - bits - finer) for finer in range(MAX_FINER.bit_length())
     )
     first = next(tables)
-    return (
-        first
-        if first.steps() is not None
-        else next((table for table in tables if table.steps() is not None), first)
-    )
+    if first.steps() is not None:
+        return first
+    return next((table for table in tables if table.steps() is not None), first)
 
 
 def _table(thresholds: Float32Array, shift: int) -> CodeTable:
@@ -421,7 +429,8 @@ class ThresholdCounter:
 
     def __init__(self, thresholds: Float32Array) -> None:
         table = code_table(thresholds)
-        self._shift, self._first_bin = table.bin_shift, table.first_bin
+        self._shift = table.bin_shift
+        self._first_bin = table.first_bin
         self._first = table.first_code.astype(np.intp)
         self._threshold = np.append(thresholds, np.float32(np.inf))
 

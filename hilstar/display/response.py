@@ -124,15 +124,17 @@ def bit_stealing_response(
         @ share
     )
     order = np.argsort(light, kind="stable")
-    rgb, light = rgb[order], light[order]
-    grey, kept = (rgb == rgb[:, :1]).all(axis=1), [0]
+    rgb = rgb[order]
+    light = light[order]
+    grey = (rgb == rgb[:, :1]).all(axis=1)
+    kept_places = [0]
     for place in range(1, len(light)):
-        if light[place] > light[kept[-1]] * (1 + SAME_LIGHT):
-            kept.append(place)
+        if light[place] > light[kept_places[-1]] * (1 + SAME_LIGHT):
+            kept_places.append(place)
         elif grey[place]:  # where lights are equal the grey one is kept
-            kept[-1] = place
-    light = light[kept] / light[kept][-1]
-    return Response(bits, light, _midway(light), black, rgb[kept].astype(np.uint16))
+            kept_places[-1] = place
+    light = light[kept_places] / light[kept_places][-1]
+    return Response(bits, light, _midway(light), black, rgb[kept_places].astype(np.uint16))
 
 
 def _midway(light: FloatArray) -> FloatArray:

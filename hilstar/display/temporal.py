@@ -108,8 +108,10 @@ def places_before(before: IntArray | None, star: IntArray) -> IntArray:
     if before is None or not len(before) or not len(star):
         return np.full(len(star), NONE_BEFORE, dtype=np.int32)
     order = np.argsort(before, kind="stable")
-    found = np.maximum(np.searchsorted(before[order], star, side="right") - 1, 0)
-    return np.where(before[order[found]] == star, order[found], NONE_BEFORE).astype(np.int32)
+    star_places = np.maximum(np.searchsorted(before[order], star, side="right") - 1, 0)
+    return np.where(before[order[star_places]] == star, order[star_places], NONE_BEFORE).astype(
+        np.int32
+    )
 
 
 def first_phases(star: IntArray, before: IntArray) -> Float32Array:

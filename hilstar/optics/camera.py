@@ -81,8 +81,8 @@ def field_terms(
 
 def _exponents(degree: int) -> tuple[IntArray, IntArray]:
     i, j = np.indices((degree + 1, degree + 1)).reshape(2, -1)
-    kept = i + j <= degree
-    return i[kept], j[kept]
+    is_within_degree = i + j <= degree
+    return i[is_within_degree], j[is_within_degree]
 
 
 def _polynomials(
@@ -167,13 +167,13 @@ def ray_shifts(camera: "Camera") -> Float32Array:
     The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's
     likewise. Where the lens has no direction the shift is 0.
     """
-    places = [
-        np.linspace(-0.5, size - 0.5, -(-size // NODE_STEP_PX) + 1) for size in camera.resolution_px
-    ]
+    places = []
+    for size in camera.resolution_px:
+        places.append(np.linspace(-0.5, size - 0.5, -(-size // NODE_STEP_PX) + 1))
     x_px, y_px = (part.ravel() for part in np.meshgrid(*places))
-    seen = camera.tangents(x_px, y_px)
+    through_lens = camera.tangents(x_px, y_px)
     plain = replace(camera, lens=None).tangents(x_px, y_px)
-    shifts = np.stack([a - b for a, b in zip(seen, plain, strict=True)], axis=-1).reshape(
+    shifts = np.stack([a - b for a, b in zip(through_lens, plain, strict=True)], axis=-1).reshape(
         len(places[1]), len(places[0]), 2
     )
     return np.nan_to_num(shifts).astype(np.float32)
@@ -229,11 +229,16 @@ class Camera:
 
     def places_outward_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `places_px`, but beyond the lens on straight lines away from the image."""
-        limit = np.inf if self.lens is None else self.lens.max_tangent * WITHIN
+        if self.lens is None:
+            limit = np.inf
+        else:
+            limit = self.lens.max_tangent * WITHIN
         beyond = np.flatnonzero(u * u + v * v > limit**2)
         if not len(beyond):
             return self.places_px(u, v)
-        times, u, v = np.hypot(u[beyond], v[beyond]) / limit, u.copy(), v.copy()
+        times = np.hypot(u[beyond], v[beyond]) / limit
+        u = u.copy()
+        v = v.copy()
         u[beyond] /= times
         v[beyond] /= times
         x_px, y_px = self.places_px(u, v)
@@ -248,7 +253,9 @@ class Camera:
     def boresight_px(self) -> tuple[float, float]:
         """The pixel of cam's +z; the principal point where that is behind the image."""
         x_px, y_px = self.project_outward(self.cam_to_image[:, 2][None])
-        return (float(x_px[0]), float(y_px[0])) if np.isfinite(x_px[0]) else self.principal_point_px
+        if np.isfinite(x_px[0]):
+            return (float(x_px[0]), float(y_px[0]))
+        return self.principal_point_px
 
     def places_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of directions (u, v, 1) in image axes, (n,) each; NaN beyond the lens."""
@@ -256,7 +263,8 @@ class Camera:
         if self.lens is None:
             return self.focal_length_px * u + cx, self.focal_length_px * v + cy
         u, v = self.lens.bent(u, v)
-        x_px, y_px = self.focal_length_px * u + cx, self.focal_length_px * v + cy
+        x_px = self.focal_length_px * u + cx
+        y_px = self.focal_length_px * v + cy
         if self.lens.field is None:
             return x_px, y_px
         dx_px, dy_px = self.lens.field.at(x_px, y_px)
@@ -268,9 +276,11 @@ class Camera:
 
         By Newton's method; NaN where it finds none, and beyond the lens.
         """
-        x_px, y_px = np.asarray(x_px, dtype=np.float64), np.asarray(y_px, dtype=np.float64)
+        x_px = np.asarray(x_px, dtype=np.float64)
+        y_px = np.asarray(y_px, dtype=np.float64)
         cx, cy = self.principal_point_px
-        u, v = (x_px - cx) / self.focal_length_px, (y_px - cy) / self.focal_length_px
+        u = (x_px - cx) / self.focal_length_px
+        v = (y_px - cy) / self.focal_length_px
         if self.lens is None:
             return u, v
         # a step may go beyond the bound
@@ -283,16 +293,19 @@ class Camera:
             area = a * d - b * c
             for _ in range(STEPS_A_ROUND):
                 x, y = free.places_px(u, v)
-                off_x, off_y = x - x_px, y - y_px
+                off_x = x - x_px
+                off_y = y - y_px
                 with np.errstate(divide="ignore", invalid="ignore"):
-                    step_u, step_v = (d * off_x - b * off_y) / area, (a * off_y - c * off_x) / area
+                    step_u = (d * off_x - b * off_y) / area
+                    step_v = (a * off_y - c * off_x) / area
                 size = np.hypot(step_u, step_v)
                 wild = ~(size < MAX_TANGENT)
-                u, v = np.where(wild, np.nan, u - step_u), np.where(wild, np.nan, v - step_v)
+                u = np.where(wild, np.nan, u - step_u)
+                v = np.where(wild, np.nan, v - step_v)
                 if not (size > NEWTON_DONE).any():
                     break
-        found = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
-        return np.where(found, u, np.nan), np.where(found, v, np.nan)
+        converged = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
+        return np.where(converged, u, np.nan), np.where(converged, v, np.nan)
 
     def slopes(self, u: FloatArray, v: FloatArray) -> Slopes:
         """How fast pixels change with the direction (u, v, 1), (n,) each."""
@@ -318,7 +331,8 @@ class Camera:
         """
         u, v = self.tangents(*self.grid_px(SPEED_PLACES))
         step = -np.cross(rate_image_rad_s, np.stack([u, v, np.ones_like(u)], axis=-1))
-        du, dv = step[..., 0] - u * step[..., 2], step[..., 1] - v * step[..., 2]
+        du = step[..., 0] - u * step[..., 2]
+        dv = step[..., 1] - v * step[..., 2]
         if self.lens is None:
             return float(self.focal_length_px * np.hypot(du, dv).max())
         a, b, c, d = self.slopes(u, v)
@@ -334,10 +348,14 @@ class Camera:
         a, b, c, d = self.slopes(u, v)
         # A tangent's step (du, dv) is an angle by the metric of the sphere, whose inverse is (1 +
         # r^2) (1 + w w^T), w = (u, v).
-        along_x, along_y, wide = a * u + b * v, c * u + d * v, 1 + u * u + v * v
-        xx, yy = wide * (a * a + b * b + along_x**2), wide * (c * c + d * d + along_y**2)
+        along_x = a * u + b * v
+        along_y = c * u + d * v
+        wide = 1 + u * u + v * v
+        xx = wide * (a * a + b * b + along_x**2)
+        yy = wide * (c * c + d * d + along_y**2)
         xy = wide * (a * c + b * d + along_x * along_y)
-        middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+        middle = (xx + yy) / 2
+        spread = np.hypot((xx - yy) / 2, xy)
         return float(np.sqrt(np.nanmin(middle - spread))), float(
             np.sqrt(np.nanmax(middle + spread))
         )
@@ -346,7 +364,10 @@ class Camera:
         """Places over the whole image, its edges among them: `count` to a row and a column, or
         (columns, rows).
         """
-        counts = (count, count) if isinstance(count, int) else count
+        if isinstance(count, int):
+            counts = (count, count)
+        else:
+            counts = count
         x, y = np.meshgrid(
             *(
                 np.linspace(-0.5, size - 0.5, n)
@@ -476,7 +497,8 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     (left, right), (top, bottom) = (
         (-0.5 - margin_px, size - 0.5 + margin_px) for size in camera.resolution_px
     )
-    across, down = np.linspace(left, right, BORDER_PLACES), np.linspace(top, bottom, BORDER_PLACES)
+    across = np.linspace(left, right, BORDER_PLACES)
+    down = np.linspace(top, bottom, BORDER_PLACES)
     border_x = np.concatenate(
         [across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)]
     )
@@ -506,7 +528,8 @@ def _wide(tangents: FloatArray) -> tuple[float, float]:
     """The smallest and the largest, and a little more: a side may bow between two of its places;
     all, where one is unknown.
     """
-    low, high = float(tangents.min()), float(tangents.max())
-    return (
-        (low - BOW * (high - low), high + BOW * (high - low)) if np.isfinite(low) else ANY_TANGENT
-    )
+    low = float(tangents.min())
+    high = float(tangents.max())
+    if np.isfinite(low):
+        return (low - BOW * (high - low), high + BOW * (high - low))
+    return ANY_TANGENT

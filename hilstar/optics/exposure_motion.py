@@ -82,17 +82,20 @@ def own_row_s(
 
     Seconds count from the middle of the middle row's exposure.
     """
-    size_px, found, step_s = paths.camera.resolution_px, seconds, 0.01 * scan.scanout_s
+    size_px = paths.camera.resolution_px
+    row_s = seconds
+    step_s = 0.01 * scan.scanout_s
 
     def late_s(at_s: FloatArray) -> FloatArray:
         return np.nan_to_num(scan.late_s(*paths.places_px(star, at_s), size_px))
 
     for _ in range(ROUNDS):
-        before, found = found, seconds + late_s(found)
-        if not len(found) or np.abs(found - before).max() < SETTLED_S:
+        before = row_s
+        row_s = seconds + late_s(row_s)
+        if not len(row_s) or np.abs(row_s - before).max() < SETTLED_S:
             break
-    share = (late_s(found + step_s) - late_s(found - step_s)) / (2 * step_s)
-    return found, 1 / (1 - np.clip(share, -MAX_ROWS_A_ROW, MAX_ROWS_A_ROW))
+    share = (late_s(row_s + step_s) - late_s(row_s - step_s)) / (2 * step_s)
+    return row_s, 1 / (1 - np.clip(share, -MAX_ROWS_A_ROW, MAX_ROWS_A_ROW))
 
 
 def smeared_sprites(
@@ -143,11 +146,9 @@ def smeared_sprites(
                 break
         else:
             sprites = join_sprites(chain, psf.footprint_px)
-            return (
-                sprites
-                if fineness == 1.0
-                else replace(sprites, capped=len(np.unique(sprites.star)))
-            )
+            if fineness == 1.0:
+                return sprites
+            return replace(sprites, capped=len(np.unique(sprites.star)))
         fineness *= COARSER
     raise InputError(
         f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate"
@@ -167,7 +168,8 @@ class _Smear:
 
     def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> FrameLight:
         """The sprites of a piece of an exposure that is `part` of it."""
-        camera, stars = self.camera, self.stars
+        camera = self.camera
+        stars = self.stars
         angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (
             end_s - begin_s + self.scan.scanout_s
         )

@@ -129,10 +129,10 @@ class DiscLight:
         that is partly behind.
         """
         air = 1 + AIR_TOP * self.disc.air_radii
-        seen = self.disc.limb(LIMB_PLACES, air) @ self.icrs_to_image.T
-        if (seen[:, 2] < BEHIND).any():
+        limb_directions = self.disc.limb(LIMB_PLACES, air) @ self.icrs_to_image.T
+        if (limb_directions[:, 2] < BEHIND).any():
             return (0, 0, *resolution_px)
-        x_px, y_px = self.camera.project_outward(seen)
+        x_px, y_px = self.camera.project_outward(limb_directions)
         if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
             return (0, 0, *resolution_px)
         sheared_px = 0.0  # how far the first and the last pixels' light is moved at most, about
@@ -152,7 +152,8 @@ class DiscLight:
             )
         edges = []
         for k, place in enumerate((x_px, y_px)):
-            low, high = float(place.min()), float(place.max())
+            low = float(place.min())
+            high = float(place.max())
             half = (
                 (high - low) / 2 * BOW
                 + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k]))
@@ -189,9 +190,9 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
             for one, most in ((light.image, np.inf), (light.cover, 1.0))
         )
         corner = light.corner_px[0] - 1, light.corner_px[1] - 1
-        return (
-            light if image is None else replace(light, image=image, cover=cover, corner_px=corner)
-        )
+        if image is None:
+            return light
+        return replace(light, image=image, cover=cover, corner_px=corner)
     x_px, y_px = light.camera.principal_point_px
     return replace(
         light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px))
@@ -210,7 +211,9 @@ def clipped(
         .tolist()
         for k in (0, 1)
     )
-    return (left, top, right - left, bottom - top) if right > left and bottom > top else None
+    if right > left and bottom > top:
+        return (left, top, right - left, bottom - top)
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,26 +271,36 @@ def _at_pose(light: DiscLight) -> list[ExtendedLight]:
         nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.psf.variance_px2) ** 0.5))
         drawn = _disc_map(light, min(max(MIN_NODES, nodes), MAX_NODES))
         return [] if drawn is None else [drawn]
-    return [] if light.region(camera.resolution_px) is None else [light]
+    if light.region(camera.resolution_px) is None:
+        return []
+    return [light]
 
 
 def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
     """Directions (n, 3), ICRS, in image axes while their own pixels are lit."""
-    seen = directions @ light.icrs_to_image.T
+    image_directions = directions @ light.icrs_to_image.T
     if light.shear is None:
-        return np.asarray(seen)
-    x_px, y_px = light.camera.project(seen)
+        return np.asarray(image_directions)
+    x_px, y_px = light.camera.project(image_directions)
     late_s = np.nan_to_num(light.shear.late_s(x_px, y_px))
-    return np.asarray(seen - late_s[:, None] * np.cross(light.shear.rate_image_rad_s, seen))
+    return np.asarray(
+        image_directions
+        - late_s[:, None] * np.cross(light.shear.rate_image_rad_s, image_directions)
+    )
 
 
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be
     seen.
     """
-    disc, camera, reach_px = light.disc, light.camera, light.psf.footprint_px / 2
+    disc = light.disc
+    camera = light.camera
+    reach_px = light.psf.footprint_px / 2
     lit = _places(light, disc, nodes)
-    whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else lit
+    if light.covers:
+        whole = _places(light, replace(disc, law="uniform"), nodes)
+    else:
+        whole = lit
     if not len(whole.x_px):
         return None
     (left, right), (top, bottom) = ((float(part.min()), float(part.max())) for part in whole[:2])
@@ -324,8 +337,6 @@ def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
     directions, law_sr = disc.points(nodes)
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
-    return (
-        FacePlaces(x_px, y_px, law_sr)
-        if known.all()
-        else FacePlaces(x_px[known], y_px[known], law_sr[known])
-    )
+    if known.all():
+        return FacePlaces(x_px, y_px, law_sr)
+    return FacePlaces(x_px[known], y_px[known], law_sr[known])

@@ -80,10 +80,12 @@ def swept_sprites(
     radius_rad, edges = camera.field(margin_px)
     reach_rad = turn.speed_rad_s * scan.whole_s / 2
     near = stars.near(icrs_to_middle[2], radius_rad, edges @ icrs_to_middle, reach_rad)
-    seen = (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam) @ stars.directions(near).T).T
-    close = camera.in_view(seen, margin_px, turn.speed_rad_s * scan.longest_s)
+    image_directions = (
+        camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam) @ stars.directions(near).T
+    ).T
+    close = camera.in_view(image_directions, margin_px, turn.speed_rad_s * scan.longest_s)
     near = near[close]
-    paths = _paths(seen[close], turn, scan, camera)
+    paths = _paths(image_directions[close], turn, scan, camera)
     late_s = np.zeros(len(paths))  # how long after the middle row each star's own row lights up
     for _ in range(2 if scan.scanout_s else 0):
         # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5
@@ -112,14 +114,16 @@ def swept_sprites(
         chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA
     )
     wanted[last <= first] = 0  # the path misses the image
-    chosen, wanting = wanted, np.flatnonzero(wanted)
-    kept = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
-    if kept is not None:  # a frame has no room for the faintest
+    chosen = wanted
+    wanting = np.flatnonzero(wanted)
+    brightest_stars = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
+    if brightest_stars is not None:  # a frame has no room for the faintest
         chosen = np.zeros_like(wanted)
-        chosen[wanting[kept]] = wanted[wanting[kept]]
+        chosen[wanting[brightest_stars]] = wanted[wanting[brightest_stars]]
     counts = within_budget(chosen, min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2))
     nodes = nodes_of(counts)
-    begin, length = first[nodes.path], (last - first)[nodes.path]
+    begin = first[nodes.path]
+    length = (last - first)[nodes.path]
     seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * span_s[nodes.path]
     x_px, y_px = paths.places_px(nodes.path, seconds)
     star = near[nodes.path]
@@ -151,10 +155,8 @@ def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bo
     """The turn itself, or one about the same axis that takes no star farther than
     MAX_TURN_FIELD; and whether it is slower.
     """
-    angle_rad, most_rad = (
-        turn.speed_rad_s * scan.whole_s,
-        MAX_TURN_FIELD * camera.field_radius_rad(0.0),
-    )
+    angle_rad = turn.speed_rad_s * scan.whole_s
+    most_rad = MAX_TURN_FIELD * camera.field_radius_rad(0.0)
     if angle_rad <= most_rad:
         return turn, False
     return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True

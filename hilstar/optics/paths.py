@@ -163,17 +163,20 @@ class Paths:
         """Tangents (2, n) of all stars at `seconds` (n,), their change in `unit_s` and half of
         the change of that.
         """
-        angle, turn = self.speed_rad_s * seconds, self.speed_rad_s * unit_s
-        cosine, sine = np.cos(angle), np.sin(angle)
-        across, faster = self._seen - self._along, self._cross * cosine
-        seen = across * cosine
-        seen -= self._cross * sine
+        angle = self.speed_rad_s * seconds
+        turn = self.speed_rad_s * unit_s
+        cosine = np.cos(angle)
+        sine = np.sin(angle)
+        across = self._seen - self._along
+        faster = self._cross * cosine
+        turned = across * cosine
+        turned -= self._cross * sine
         faster += across * sine  # the axis times what is seen
-        bend = seen * (-turn * turn / 2)
-        seen += self._along
+        bend = turned * (-turn * turn / 2)
+        turned += self._along
         faster *= -turn
-        near = 1 / seen[2]
-        at = seen[:2] * near
+        near = 1 / turned[2]
+        at = turned[:2] * near
         first = (faster[:2] - at * faster[2]) * near
         return at, first, (bend[:2] - at * bend[2] - first * faster[2]) * near
 
@@ -227,25 +230,29 @@ class Chords:
         (Liang and Barsky 1984.) A chord with one end behind the camera counts whole where the other
         end is on the image.
         """
-        begin, end = np.zeros(self.x_px.shape[1]), np.ones(self.x_px.shape[1])
+        begin = np.zeros(self.x_px.shape[1])
+        end = np.ones(self.x_px.shape[1])
         for ends, size in ((self.x_px, resolution_px[0]), (self.y_px, resolution_px[1])):
-            low, high = -0.5 - np.asarray(margin_px), size - 0.5 + np.asarray(margin_px)
+            low = -0.5 - np.asarray(margin_px)
+            high = size - 0.5 + np.asarray(margin_px)
             step = ends[1] - ends[0]
             still = np.abs(step) < 1e-9
             step = np.where(still, 1.0, step)
-            a, b = (low - ends[0]) / step, (high - ends[0]) / step
+            a = (low - ends[0]) / step
+            b = (high - ends[0]) / step
             outside = still & ((ends[0] < low) | (ends[0] > high))
             begin = np.maximum(
                 begin, np.where(still, np.where(outside, 1.0, 0.0), np.minimum(a, b))
             )
             end = np.minimum(end, np.where(still, np.where(outside, 0.0, 1.0), np.maximum(a, b)))
-        seen = end > begin
+        is_crossed = end > begin
         finite, (width, height) = np.isfinite(self.x_px), resolution_px
         there = (np.abs(self.x_px - width / 2) <= width) & (
             np.abs(self.y_px - height / 2) <= height
         )
         half_seen = (finite.sum(axis=0) == 1) & there.any(axis=0)
-        begin, end = np.where(seen, begin, 1.0), np.where(seen, end, 0.0)
+        begin = np.where(is_crossed, begin, 1.0)
+        end = np.where(is_crossed, end, 0.0)
         begin[half_seen], end[half_seen] = 0.0, 1.0
         return begin, end
 
@@ -277,7 +284,8 @@ class ShortPaths:
         self.camera = exact.camera
         self.speed_rad_s = exact.speed_rad_s
         self._count = len(exact)
-        self._middle_s, self._half_s = middle_s, half_s
+        self._middle_s = middle_s
+        self._half_s = half_s
         if points == 1:
             self._terms = _lens_table(*_mapping(exact.camera)).along(
                 *exact.tangents_at(middle_s, half_s)
@@ -299,9 +307,10 @@ class ShortPaths:
     ) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,)."""
         at = (seconds - self._middle_s[star]) / self._half_s
-        terms = (
-            self._terms[:, :, star] if isinstance(star, slice) else self._terms.take(star, axis=2)
-        )
+        if isinstance(star, slice):
+            terms = self._terms[:, :, star]
+        else:
+            terms = self._terms.take(star, axis=2)
         places = terms[-1] * at
         for term in terms[-2:0:-1]:
             places += term
@@ -338,7 +347,8 @@ class LensTable:
             (node[1] * self.shape[0] + node[0]).astype(np.intp), axis=2
         )
         (u, v), (first_u, first_v), (bend_u, bend_v) = off, by * self.steps, bend * self.steps
-        steep_u, steep_v = uu * u, vv * v
+        steep_u = uu * u
+        steep_v = vv * v
         place += u * (by_u + steep_u)
         cross = uv * u
         place += v * (by_v + cross + steep_v)
@@ -374,19 +384,25 @@ def _lens_table(
     across, down = (np.arange(-1, round(side / step) + 2) for side in high - low)
     u, v = np.meshgrid(low[0] + step * across, low[1] + step * down)
     at = np.stack(camera.places_outward_px(u.ravel(), v.ravel())).reshape(2, *u.shape)
-    middle, row, column = at[:, 1:-1, 1:-1], at[:, 1:-1], at[..., 1:-1]
-    left, right, above, below = row[..., :-2], row[..., 2:], column[:, :-2], column[:, 2:]
+    middle = at[:, 1:-1, 1:-1]
+    row = at[:, 1:-1]
+    column = at[..., 1:-1]
+    left = row[..., :-2]
+    right = row[..., 2:]
+    above = column[:, :-2]
+    below = column[:, 2:]
     cross = (at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]) / 4
     bends = (left + right) / 2 - middle, cross, (above + below) / 2 - middle
     terms = np.stack([middle, (right - left) / 2, (below - above) / 2, *bends]).reshape(6, 2, -1)
     table = LensTable(low[:, None], 1 / step, (len(across) - 2, len(down) - 2), terms)
     between = np.stack([u.ravel(), v.ravel()]) + step / 2  # where a table of second degree is worst
-    found, exact = (
-        table.along(between, *np.zeros((2, 2, 1)))[0],
-        np.stack(camera.places_outward_px(*between)),
-    )
+    interpolated = table.along(between, *np.zeros((2, 2, 1)))[0]
+    exact = np.stack(camera.places_outward_px(*between))
     return replace(
-        table, off_px=float(np.hypot(*(found - exact))[camera.contains_px(*exact)].max(initial=0.0))
+        table,
+        off_px=float(
+            np.hypot(*(interpolated - exact))[camera.contains_px(*exact)].max(initial=0.0)
+        ),
     )
 
 
@@ -406,7 +422,10 @@ def bend_px(camera: Camera) -> float:
     if camera.lens is None:
         return 0.0
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
-    bent, ideal = (np.stack(seen.places_px(u, v)) for seen in (camera, replace(camera, lens=None)))
+    bent, ideal = (
+        np.stack(view_camera.places_px(u, v))
+        for view_camera in (camera, replace(camera, lens=None))
+    )
     return float(np.nanmax(np.hypot(*(bent - ideal))))
 
 
@@ -421,11 +440,10 @@ def _longest_half_turns_rad(
     turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
     few = POINTS
     if lens is not None and lens.max_tangent < WIDEST_TABLE:
-        few = (
-            LENS_POINTS
-            if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX
-            else POINTS
-        )
+        if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX:
+            few = LENS_POINTS
+        else:
+            few = POINTS
     firsts = [
         bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0)
         for points in few
@@ -439,28 +457,28 @@ def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
     """
     camera = _beyond(camera)
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
-    seen = np.column_stack([u, v, np.ones_like(u)])[np.isfinite(u)]
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    directions = np.column_stack([u, v, np.ones_like(u)])[np.isfinite(u)]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     middle_px, half_px = ((np.array(camera.resolution_px)[:, None, None] - k) / 2 for k in (1, 0))
     worst = 0.0
     for axis in TRIED_AXES:
-        exact = Paths(seen, np.array(axis), camera)
+        exact = Paths(directions, np.array(axis), camera)
         half_s = half_turn_rad / exact.speed_rad_s
         moments = np.linspace(0.0, 2 * half_s, TRIED_MOMENTS)
-        short = ShortPaths(exact, np.full(len(seen), half_s), half_s, points)
-        found = [short.places_px(slice(None), np.full(len(seen), moment)) for moment in moments]
+        short = ShortPaths(exact, np.full(len(directions), half_s), half_s, points)
+        places_px = [
+            short.places_px(slice(None), np.full(len(directions), moment)) for moment in moments
+        ]
         places = np.stack(exact.all_places_px(moments[:, None]))
         allowed = np.maximum(LIMIT_PX, LIMIT_SHARE * np.hypot(*(places[:, -1] - places[:, 0])))
         on_image = (np.abs(places - middle_px) <= half_px).all(axis=0)
-        excess = np.hypot(*(np.stack(found, axis=1) - places)) / allowed
+        excess = np.hypot(*(np.stack(places_px, axis=1) - places)) / allowed
         worst = max(worst, float(excess[on_image].max(initial=0.0)))
     return worst
 
 
 def _beyond(camera: Camera) -> Camera:
     lens = camera.lens
-    return (
-        camera
-        if lens is None
-        else replace(camera, lens=replace(lens, max_tangent=lens.max_tangent * BEYOND_LENS))
-    )
+    if lens is None:
+        return camera
+    return replace(camera, lens=replace(lens, max_tangent=lens.max_tangent * BEYOND_LENS))

@@ -299,10 +299,9 @@ class GaussianPsf(Psf):
         scale = [2 * (sigma**2 + 1 / 12) for sigma in self.sigma_px]
         places = np.linspace(0.0, self.footprint_px / 2 + 0.5, BOUND_PLACES)
         shares = [np.maximum(pixel_shares(places, sigma), 1e-300) for sigma in self.sigma_px]
-        more = [
-            float((np.log(share) + places**2 / along).max())
-            for share, along in zip(shares, scale, strict=True)
-        ]
+        more = []
+        for share, along in zip(shares, scale, strict=True):
+            more.append(float((np.log(share) + places**2 / along).max()))
         return Reach((scale[0], scale[1]), math.exp(sum(more)))
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -429,10 +428,8 @@ class SampledPsf(Psf):
         # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the
         # largest of those below zero
         phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
-        least, negative = (
-            min(float(part.sum()) for part in phases),
-            max(float(-part.clip(max=0).sum()) for part in phases),
-        )
+        least = min(float(part.sum()) for part in phases)
+        negative = max(float(-part.clip(max=0).sum()) for part in phases)
         if negative > self.max_negative:
             raise InputError(
                 f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample"
@@ -456,24 +453,22 @@ class SampledPsf(Psf):
         # 0.2 s of every command that needs none of it
         from scipy.interpolate import make_interp_spline
 
-        found = self.samples / self.samples.sum() * self.per_px**2
+        density = self.samples / self.samples.sum() * self.per_px**2
         for axis, at_px in ((0, y_px), (1, x_px)):
             black = [(BLACK_SAMPLES, BLACK_SAMPLES) if k == axis else (0, 0) for k in (0, 1)]
-            found = np.pad(found, black)
-            place_px = (np.arange(found.shape[axis]) - found.shape[axis] // 2) / self.per_px
-            spline, last_px = (
-                make_interp_spline(place_px, found, SPLINE_DEGREE, axis=axis),
-                place_px[-1],
-            )
+            density = np.pad(density, black)
+            place_px = (np.arange(density.shape[axis]) - density.shape[axis] // 2) / self.per_px
+            spline = make_interp_spline(place_px, density, SPLINE_DEGREE, axis=axis)
+            last_px = place_px[-1]
             if self.pixel_integrated:
-                found = spline(np.clip(at_px, -last_px, last_px))
+                density = spline(np.clip(at_px, -last_px, last_px))
             else:
                 light = spline.antiderivative()
                 low, high = (
                     light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5)
                 )
-                found = high - low
-        return np.asarray(found)
+                density = high - low
+        return np.asarray(density)
 
     @cached_property
     def _halves(self) -> FloatArray:
@@ -486,7 +481,8 @@ class SampledPsf(Psf):
     def width_px(self) -> tuple[float, float]:
         """Adaptive moments (Bernstein and Jarvis 2002), less a pixel's own variance."""
         at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
-        middle, variance = np.zeros(2), np.ones(2)
+        middle = np.zeros(2)
+        variance = np.ones(2)
         # a Gaussian weight as wide as the PSF halves its variance and its distance
         for _ in range(WIDTH_ROUNDS):
             powers = at_px ** np.arange(3)[:, None]
@@ -522,7 +518,8 @@ class SampledPsf(Psf):
         Linear interpolation keeps their sum, and their centroid, at all phases between. At the
         edges they are 0.
         """
-        side_px, steps = self.footprint_px, self._steps
+        side_px = self.footprint_px
+        steps = self._steps
         at_px = np.arange(side_px * steps) / steps - side_px / 2
         shares = np.maximum(self._before_cut(at_px, at_px), 0.0)
         shares[0], shares[:, 0] = 0.0, 0.0
@@ -543,15 +540,15 @@ class SampledPsf(Psf):
         squares = ((np.arange(len(self._table)) - len(self._table) // 2) / self._steps) ** 2
         logs = np.log(np.maximum(self._table, 1e-30))
 
-        found = []
+        reaches = []
         for scale in 2 * np.geomspace(1.0, 300.0, 20):
             x, y = (float(scale) * variance for variance in self.variance_px2)
             # the table is interpolated
             log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01
-            found.append(
+            reaches.append(
                 (scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y))
             )
-        _, log_factor, axes_px2 = min(found)
+        _, log_factor, axes_px2 = min(reaches)
         return Reach(axes_px2, math.exp(log_factor))
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -559,7 +556,9 @@ class SampledPsf(Psf):
         last = len(self._table) - 1
         at_x, at_y = (np.clip(at * self._steps + last / 2, 0, last) for at in (x_px, y_px))
         column, row = (np.minimum(at.astype(np.intp), last - 1) for at in (at_x, at_y))
-        x, y, first = at_x - column, at_y - row, row * (last + 1) + column
+        x = at_x - column
+        y = at_y - row
+        first = row * (last + 1) + column
         table = self._table.ravel()
         above, below = (
             (1 - x) * table[first + down] + x * table[first + down + 1] for down in (0, last + 1)
@@ -584,7 +583,8 @@ class SampledPsf(Psf):
         """Point after point: each has its own pixels."""
         left, top, width, height = region
         image = np.zeros((height, width))
-        columns, rows = np.arange(left, left + width), np.arange(top, top + height)
+        columns = np.arange(left, left + width)
+        rows = np.arange(top, top + height)
         for x, y, light in zip(x_px, y_px, electrons_per_s, strict=True):
             near_x, near_y = (
                 np.abs(at - middle) < self.footprint_px / 2
@@ -600,11 +600,10 @@ class SampledPsf(Psf):
         first = len(self._halves) // 2 - size_px
         if first < 0:
             return 0.0
-        insides = [
-            self._halves[y : y + 2 * size_px : 2, x : x + 2 * size_px : 2]
-            for y in (first, first + 2)
-            for x in (first, first + 2)
-        ]
+        insides = []
+        for y in (first, first + 2):
+            for x in (first, first + 2):
+                insides.append(self._halves[y : y + 2 * size_px : 2, x : x + 2 * size_px : 2])
         return max(0.0, 1 - min(float(part.sum()) for part in insides))
 
     def outside_share(self, size_px: int) -> float:
@@ -621,12 +620,10 @@ class SampledPsf(Psf):
         """The same table: in each cell between four places what its bilinear interpolation is
         made of.
         """
-        near, right, down, both = (
-            self._table[:-1, :-1],
-            self._table[:-1, 1:],
-            self._table[1:, :-1],
-            self._table[1:, 1:],
-        )
+        near = self._table[:-1, :-1]
+        right = self._table[:-1, 1:]
+        down = self._table[1:, :-1]
+        both = self._table[1:, 1:]
         cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
         return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
 
@@ -653,8 +650,10 @@ def read_psf(path: Path) -> SampledPsf:
 def _psf_in(path: Path, content: bytes) -> SampledPsf:
     try:
         with opened_fits(content) as hdus:
-            image, header = np.asarray(hdus[0].data), hdus[0].header
-            per_px, integrated = header.get("OVERSAMP", 1), header.get("PIXINT", False)
+            image = np.asarray(hdus[0].data)
+            header = hdus[0].header
+            per_px = header.get("OVERSAMP", 1)
+            integrated = header.get("PIXINT", False)
     except ImageSizeError as error:
         raise InputError(f"{path}: {error}; {FILE_ADVICE}") from error
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
@@ -700,7 +699,8 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
     The complement erfc of both edges keeps the far wings positive and exact where erf differences
     cancel.
     """
-    near, far = abs(offset_px) - 0.5, abs(offset_px) + 0.5
+    near = abs(offset_px) - 0.5
+    far = abs(offset_px) + 0.5
     return 0.5 * (math.erfc(near / (sigma_px * SQRT2)) - math.erfc(far / (sigma_px * SQRT2)))
 
 
@@ -712,7 +712,8 @@ def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
         )
     from scipy.special import erfc  # as in `stamps`
 
-    near, far = np.abs(offset_px) - 0.5, np.abs(offset_px) + 0.5
+    near = np.abs(offset_px) - 0.5
+    far = np.abs(offset_px) + 0.5
     return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
 
 
@@ -737,7 +738,8 @@ def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -
 def _shader_erf(value: Float32Array) -> Float32Array:
     x = np.clip(value, np.float32(-ERF_REACH), np.float32(ERF_REACH))
     square = x * x
-    above, below = np.full_like(x, ERF_ABOVE[0]), np.full_like(x, ERF_BELOW[0])
+    above = np.full_like(x, ERF_ABOVE[0])
+    below = np.full_like(x, ERF_BELOW[0])
     for sum_, terms in ((above, ERF_ABOVE), (below, ERF_BELOW)):
         for term in terms[1:]:
             sum_ *= square
@@ -757,15 +759,16 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
     # close together at the edge, as Chebyshev's
     distance_px = reach_px * np.sin(np.linspace(0.0, np.pi / 2, FIT_PLACES))
     shares = np.array([pixel_share(float(place), sigma_px) for place in distance_px])
-    wanted, scaled = np.log2(np.maximum(shares, shares[0] * 1e-12)), (distance_px / reach_px) ** 2
+    wanted = np.log2(np.maximum(shares, shares[0] * 1e-12))
+    scaled = (distance_px / reach_px) ** 2
     for degree in range(MIN_DEGREE, MAX_DEGREE + 1):
         terms = np.polynomial.chebyshev.chebvander(2 * scaled - 1, degree)
         weight = np.maximum(shares / shares[0], 1e-7)
         for _ in range(FIT_ROUNDS):
-            found = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)[0]
-            error = np.abs(np.exp2(np.minimum(terms @ found, 0.0)) - shares)
+            coefficients = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)[0]
+            error = np.abs(np.exp2(np.minimum(terms @ coefficients, 0.0)) - shares)
             if error.max() <= MAX_SHARE_ERROR:
-                power = np.polynomial.Chebyshev(found, domain=[0.0, reach_px**2]).convert(
+                power = np.polynomial.Chebyshev(coefficients, domain=[0.0, reach_px**2]).convert(
                     kind=np.polynomial.Polynomial
                 )
                 return tuple(power.coef.tolist())

@@ -42,7 +42,9 @@ def cell_quadrature(side_px: float, count: int = NODES) -> tuple[FloatArray, Flo
     at = (np.arange(SIDE_STEPS) + 0.5) / SIDE_STEPS * width_px - width_px / 2
     weight = np.clip(width_px / 2 - np.abs(at), 0, min(1.0, side_px))
     weight /= weight.sum()
-    before, now, norm = np.zeros_like(at), np.ones_like(at), 1.0
+    before = np.zeros_like(at)
+    now = np.ones_like(at)
+    norm = 1.0
     ratio = 0.0
     ratios: list[float] = []
     for _ in range(count - 1):
@@ -85,7 +87,8 @@ class PixelGaussians:
         self._x = x_px[:, :, None] + at[:, None]
         self._y = y_px[:, :, None] + at[:, None]
         self._size = len(at), y_px.shape[1], x_px.shape[1]
-        x, y = self._x.reshape(len(at), -1), self._y.reshape(len(at), -1)
+        x = self._x.reshape(len(at), -1)
+        y = self._y.reshape(len(at), -1)
         scale = -0.5 / determinant
         light = (-2 * scale * xy)[:, None, None] * y[:, :, None] * x[:, None]
         light += (scale * xx)[:, None, None] * (y * y)[:, :, None]
@@ -103,13 +106,20 @@ class PixelGaussians:
         """Shares (n, h, w), and their derivatives by the middle's x and y; with `shape` also by xx,
         yy and xy.
         """
-        by_x0, by_x1 = self._over_x(0), self._over_x(1)
-        share, x, y = self._moment(by_x0, 0), self._moment(by_x1, 0), self._moment(by_x0, 1)
-        xx, yy, xy, determinant = self._xx, self._yy, self._xy, self._determinant
+        by_x0 = self._over_x(0)
+        by_x1 = self._over_x(1)
+        share = self._moment(by_x0, 0)
+        x = self._moment(by_x1, 0)
+        y = self._moment(by_x0, 1)
+        xx = self._xx
+        yy = self._yy
+        xy = self._xy
+        determinant = self._determinant
         first = [share, (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant]
         if not shape:
             return first
-        x2, x1y1 = self._moment(self._over_x(2), 0), self._moment(by_x1, 1)
+        x2 = self._moment(self._over_x(2), 0)
+        x1y1 = self._moment(by_x1, 1)
         y2 = self._moment(by_x0, 2)
         square = determinant**2
         u2 = (yy * yy * x2 - 2 * yy * xy * x1y1 + xy * xy * y2) / square
@@ -200,7 +210,9 @@ def fit_each(
     """The Gaussian of each image; where all are `alike`, one covariance for all: its steps are the
     medians of theirs.
     """
-    x_px, y_px, covariance = start.x_px, start.y_px, start.covariance
+    x_px = start.x_px
+    y_px = start.y_px
+    covariance = start.covariance
     cell_px = 1 + float(points.side_px.max(initial=0.0))
     for _ in range(rounds):
         sigma_px = float(np.sqrt(bounded(covariance)[:, :XY].min()))
@@ -219,7 +231,8 @@ def fit_each(
         variance = bounded(covariance)
         most = MAX_STEP_SHARE * np.sqrt(variance[:, XX] * variance[:, YY])[:, None]
         covariance = bounded(covariance + np.clip(growth, -most, most))
-        x_px, y_px = x_px + moves[:, 0], y_px + moves[:, 1]
+        x_px = x_px + moves[:, 0]
+        y_px = y_px + moves[:, 1]
     return PointGaussians(x_px, y_px, covariance)
 
 

@@ -17,9 +17,9 @@ class Orientation:
 
     def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
         """The screen that an image of `resolution_px` fills."""
-        return (
-            resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
-        )
+        if self.quarter_turns % 2 == 0:
+            return resolution_px
+        return (resolution_px[1], resolution_px[0])
 
     @property
     def down(self) -> tuple[int, int]:
@@ -31,7 +31,8 @@ class Orientation:
 
     def in_image(self, right: float, down: float) -> tuple[float, float]:
         """A step on the screen, right and down, in image axes."""
-        right, down = -right if self.flip_x else right, -down if self.flip_y else down
+        right = -right if self.flip_x else right
+        down = -down if self.flip_y else down
         for _ in range(self.quarter_turns % 4):
             right, down = down, -right
         return right, down
@@ -92,6 +93,9 @@ class Scan:
         edge.
         """
         middle_x, middle_y = ((size - 1) / 2 for size in resolution_px)
-        rows = resolution_px[0] if self.down[0] else resolution_px[1]
+        if self.down[0]:
+            rows = resolution_px[0]
+        else:
+            rows = resolution_px[1]
         place = (self.down[0] * (x_px - middle_x) + self.down[1] * (y_px - middle_y)) / rows
         return np.asarray(np.clip(place, -0.5, 0.5) * self.scanout_s)

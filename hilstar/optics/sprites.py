@@ -164,7 +164,9 @@ class FrameLight:
     @property
     def star_count(self) -> int:
         """How many stars have a sprite here."""
-        return len(self) if self.per_star == 1 else len(np.unique(self.star))
+        if self.per_star == 1:
+            return len(self)
+        return len(np.unique(self.star))
 
 
 def make_sprites(
@@ -182,21 +184,26 @@ def make_sprites(
     margin_px = footprint_px / 2 + 1
     if candidates is None:
         near = stars_about(stars, icrs_to_image, camera, margin_px)
-        directions, electrons_per_s = stars.directions(near).T, stars.electrons_per_s.take(near)
+        directions = stars.directions(near).T
+        electrons_per_s = stars.electrons_per_s.take(near)
     else:
         near, directions, electrons_per_s = candidates.near(stars, icrs_to_image, camera, margin_px)
-    seen = (icrs_to_image @ directions).T  # component by component, as they are kept
+    image_directions = (icrs_to_image @ directions).T  # component by component, as they are kept
     if camera.lens is not None:  # with a pinhole, projecting all costs less than selecting
-        close = camera.in_view(seen, margin_px, 0.0)
-        near, seen, electrons_per_s = near[close], seen[close], electrons_per_s[close]
-    x_px, y_px = camera.project(seen)
+        close = camera.in_view(image_directions, margin_px, 0.0)
+        near = near[close]
+        image_directions = image_directions[close]
+        electrons_per_s = electrons_per_s[close]
+    x_px, y_px = camera.project(image_directions)
     sprites = pack_sprites(x_px, y_px, electrons_per_s, near, camera.resolution_px, footprint_px)
-    kept = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
-    if kept is None:
+    brightest_rows = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
+    if brightest_rows is None:
         return sprites
-    dropped = len(sprites) - len(kept)
-    star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
-    return FrameLight(sprites.data[kept], footprint_px, star, x_px, y_px, capped=dropped)
+    dropped = len(sprites) - len(brightest_rows)
+    star = sprites.star[brightest_rows]
+    x_px = sprites.x_px[brightest_rows]
+    y_px = sprites.y_px[brightest_rows]
+    return FrameLight(sprites.data[brightest_rows], footprint_px, star, x_px, y_px, capped=dropped)
 
 
 def max_stars(footprint_px: int) -> int:
@@ -232,16 +239,17 @@ def pack_sprites(
     after = footprint_px - 1 - before
     inside = _between(x_px, -after - bias, width + before - bias)
     inside &= _between(y_px, -after - bias, height + before - bias)
-    seen = inside.nonzero()[0]
-    x_px, y_px = x_px.take(seen), y_px.take(seen)
-    data = np.empty(len(seen), dtype=SPRITE_DTYPE)
+    inside_rows = inside.nonzero()[0]
+    x_px = x_px.take(inside_rows)
+    y_px = y_px.take(inside_rows)
+    data = np.empty(len(inside_rows), dtype=SPRITE_DTYPE)
     whole, part = (data.view(kind).reshape(-1, 5) for kind in (np.int32, np.float32))
     for column, place_px in enumerate((x_px, y_px)):
         pixel = np.floor(place_px + bias)
         whole[:, column] = pixel
         part[:, 2 + column] = place_px - pixel
-    part[:, 4] = electrons_per_s.take(seen)
-    return FrameLight(data, footprint_px, star.take(seen), x_px, y_px)
+    part[:, 4] = electrons_per_s.take(inside_rows)
+    return FrameLight(data, footprint_px, star.take(inside_rows), x_px, y_px)
 
 
 def _between(place_px: FloatArray, first: float, end: float) -> npt.NDArray[np.bool_]:
@@ -287,11 +295,9 @@ def by_channel(sprites: FrameLight, stars: Stars) -> list[FrameLight]:
 
     `stars` are those among which `sprites.star` has its places.
     """
-    return (
-        [sprites]
-        if stars.colours is None
-        else by_share(sprites, stars, stars.colours, stars.colours_by_bv)
-    )
+    if stars.colours is None:
+        return [sprites]
+    return by_share(sprites, stars, stars.colours, stars.colours_by_bv)
 
 
 def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
@@ -306,11 +312,12 @@ def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
     """Shares (n, columns) of stars at places (n,); below 0, where light is no star's, their
     `mean_share`.
     """
-    found, own = np.empty((len(places), shares.shape[1])), places >= 0
-    found[own] = shares[places[own]]
-    if not own.all():
-        found[~own] = mean_share(shares, stars)
-    return found
+    place_shares = np.empty((len(places), shares.shape[1]))
+    is_star = places >= 0
+    place_shares[is_star] = shares[places[is_star]]
+    if not is_star.all():
+        place_shares[~is_star] = mean_share(shares, stars)
+    return place_shares
 
 
 def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
@@ -322,11 +329,12 @@ def shares_of_sprites(
     sprites: FrameLight, stars: Stars, shares: FloatArray, by_bv: FloatArray | None
 ) -> FloatArray:
     """The shares (n, columns) of each sprite's light, by those of each star; see `by_share`."""
-    found, added = shares_at(shares, stars, sprites.star), sprites.star < 0
+    sprite_shares = shares_at(shares, stars, sprites.star)
+    added = sprites.star < 0
     if by_bv is not None and added.any():
         own_mag = np.array([light.bv_mag for light in sprites.added])
-        found[added] = shares_by_bv(by_bv, own_mag[-1 - sprites.star[added]])
-    return found
+        sprite_shares[added] = shares_by_bv(by_bv, own_mag[-1 - sprites.star[added]])
+    return sprite_shares
 
 
 def by_primary(sprites: FrameLight, places_px: FloatArray, k: int) -> FrameLight:
@@ -334,7 +342,8 @@ def by_primary(sprites: FrameLight, places_px: FloatArray, k: int) -> FrameLight
     within a pixel, lies there.
     """
     # as in pack_sprites
-    data, bias = sprites.data.copy(), np.float32(0.5 if sprites.footprint_px % 2 else 0.0)
+    data = sprites.data.copy()
+    bias = np.float32(0.5 if sprites.footprint_px % 2 else 0.0)
     if sprites.primaries is not None:
         data["electrons_per_s"] = sprites.primaries[:, k]
     for column, away_px in enumerate(places_px[k]):
@@ -346,11 +355,9 @@ def by_primary(sprites: FrameLight, places_px: FloatArray, k: int) -> FrameLight
         data["pixel"][:, column] += whole.astype(np.int32)
         data["fraction_px"][:, column] = part - whole
     right, down = places_px[k]
-    x_px, y_px, lights = (
-        sprites.x_px - right,
-        sprites.y_px - down,
-        sprites.lights[k] if sprites.lights else (),
-    )
+    x_px = sprites.x_px - right
+    y_px = sprites.y_px - down
+    lights = sprites.lights[k] if sprites.lights else ()
     return replace(
         sprites, data=data, x_px=x_px, y_px=y_px, extended=lights, primaries=None, lights=()
     )
@@ -394,8 +401,11 @@ def extended_by_share(
         ):
             wide[place] = shares_by_bv(by_bv, bv_mag)
     return [
-        tuple(times(light, float(part)) for light, part in zip(sprites.extended, one, strict=True))
-        for one in wide.T
+        tuple(
+            times(light, float(part))
+            for light, part in zip(sprites.extended, channel_shares, strict=True)
+        )
+        for channel_shares in wide.T
     ]
 
 
@@ -425,19 +435,22 @@ def clipped_sprites(
         _, star = np.unique(sprites.star, return_inverse=True)
         rates = np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
     bright = (rates > bright_e_per_s).nonzero()[0]
-    x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
+    x = np.rint(sprites.x_px[bright]).astype(int)
+    y = np.rint(sprites.y_px[bright]).astype(int)
     inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
-    bright, x, y = bright[inside], x[inside], y[inside]
+    bright = bright[inside]
+    x = x[inside]
+    y = y[inside]
     limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
     if uniformity is not None:
         limit *= uniformity[y, x]
-    own = sprites.data["electrons_per_s"][bright] * psf.shares(
+    own_light = sprites.data["electrons_per_s"][bright] * psf.shares(
         x - sprites.x_px[bright], y - sprites.y_px[bright]
     )
-    over = own > limit
+    over = own_light > limit
     doubtful = (~over).nonzero()[0]
     if len(doubtful) > MAX_DOUBTFUL:
-        doubtful = doubtful[np.argpartition(-own[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
+        doubtful = doubtful[np.argpartition(-own_light[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
     if len(doubtful):
         over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], psf) > limit[doubtful]
     return np.asarray(bright[over], dtype=np.intp)
@@ -445,7 +458,8 @@ def clipped_sprites(
 
 def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatArray:
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
-    pixel, reach = sprites.data["pixel"], sprites.footprint_px / 2
+    pixel = sprites.data["pixel"]
+    reach = sprites.footprint_px / 2
     # Sprites whose footprints can reach one of the columns and rows, and some more
     close = np.flatnonzero(
         _reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px)
@@ -466,7 +480,9 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
     other = order[np.arange(len(pixel)) + np.repeat(first - (np.cumsum(count) - count), count)]
     offset_y = y[pixel] - sprites.y_px[other]
     near = np.abs(offset_y) <= reach
-    pixel, other, offset_y = pixel[near], other[near], offset_y[near]
+    pixel = pixel[near]
+    other = other[near]
+    offset_y = offset_y[near]
     share = psf.shares(x[pixel] - sprites.x_px[other], offset_y)
     return np.asarray(
         np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)),

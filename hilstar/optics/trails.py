@@ -127,7 +127,8 @@ def trails(
     `faintest_e_per_s` is left out.
     """
     wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
-    counts, total = wanted, int(wanted.sum())
+    counts = wanted
+    total = int(wanted.sum())
     if total > brush.most:  # in proportion, one at least
         counts = np.minimum(wanted, np.maximum(1, (wanted * (brush.most / total)).astype(np.intp)))
     path = np.repeat(np.arange(len(seen)), counts)
@@ -139,16 +140,20 @@ def trails(
     light = seen.rates_e_per_s(path, first_s, last_s) * part
     rates = np.asarray(np.bincount(path, light, minlength=len(seen)), dtype=np.float64)
     shown = (rates > 0) & (rates >= faintest_e_per_s)
-    kept = shown[path] & (light > 0)
-    star, size_px = seen.index[path[kept]], view.camera.resolution_px
+    is_lit = shown[path] & (light > 0)
+    star = seen.index[path[is_lit]]
+    size_px = view.camera.resolution_px
     sprites = pack_sprites(
-        x_px[kept], y_px[kept], light[kept], star, size_px, brush.psf.footprint_px
+        x_px[is_lit], y_px[is_lit], light[is_lit], star, size_px, brush.psf.footprint_px
     )
-    found = np.flatnonzero(np.isin(seen.index, sprites.star))
-    most = int(np.bincount(path[kept], minlength=1).max(initial=1))
-    sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[found].sum()))
+    trailed = np.flatnonzero(np.isin(seen.index, sprites.star))
+    most = int(np.bincount(path[is_lit], minlength=1).max(initial=1))
+    sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[trailed].sum()))
     return Trails(
-        sprites, seen.index[found], rates[found], seen.directions(found, lit.middle_s[found])
+        sprites,
+        seen.index[trailed],
+        rates[trailed],
+        seen.directions(trailed, lit.middle_s[trailed]),
     )
 
 
@@ -161,7 +166,8 @@ def sprite_counts(
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)
     x_px, y_px = view.places_px(seen, which, (lit.begin_s + at * lit.length_s).ravel())
-    x_px, y_px = x_px.reshape(SAMPLES, -1), y_px.reshape(SAMPLES, -1)
+    x_px = x_px.reshape(SAMPLES, -1)
+    y_px = y_px.reshape(SAMPLES, -1)
     ends = Chords(x_px[[0, -1]], y_px[[0, -1]])
     off_x, off_y = ((1 - at) * place[0] + at * place[-1] - place for place in (x_px, y_px))
     bulge_px = BULGE * np.sqrt((off_x * off_x + off_y * off_y).max(axis=0))
@@ -184,10 +190,12 @@ def with_trails(sprites: FrameLight, found: Trails, first: int) -> FrameLight:
     """Stars' sprites and after them those of satellites, whose places in `Stars` begin at
     `first`.
     """
-    own = found.sprites
-    whole = with_sprites(sprites, [replace(own, star=own.star + first)])
+    trail_sprites = found.sprites
+    whole = with_sprites(sprites, [replace(trail_sprites, star=trail_sprites.star + first)])
     return replace(
-        whole, per_star=max(sprites.per_star, own.per_star), capped=sprites.capped + own.capped
+        whole,
+        per_star=max(sprites.per_star, trail_sprites.per_star),
+        capped=sprites.capped + trail_sprites.capped,
     )
 
 
@@ -248,7 +256,8 @@ def disc_trail(
     if not count:
         return None
     edges_s = lit.begin_s[0] + np.linspace(begin[0], end[0], count + 1) * lit.length_s
-    middles_s, share = (edges_s[1:] + edges_s[:-1]) / 2, float(end[0] - begin[0]) / count
+    middles_s = (edges_s[1:] + edges_s[:-1]) / 2
+    share = float(end[0] - begin[0]) / count
     rates = seen.rates_e_per_s(np.zeros(count, dtype=np.intp), edges_s[:-1], edges_s[1:])
     if not rates.any():
         return None
@@ -295,11 +304,13 @@ def hidden(sprites: FrameLight, directions: FloatArray, found: DiscTrail) -> Fra
     """Sprites of stars seen in `directions` (n, 3), each without the share of its light that a
     satellite hides.
     """
-    left = np.ones(len(sprites))
+    share_left = np.ones(len(sprites))
     for disc, share in zip(found.along, found.shares, strict=True):
-        left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))
-    kept = left > 0
-    data = sprites.data[kept]
-    data["electrons_per_s"] *= left[kept].astype(np.float32)
-    star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
+        share_left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))
+    is_visible = share_left > 0
+    data = sprites.data[is_visible]
+    data["electrons_per_s"] *= share_left[is_visible].astype(np.float32)
+    star = sprites.star[is_visible]
+    x_px = sprites.x_px[is_visible]
+    y_px = sprites.y_px[is_visible]
     return replace(sprites, data=data, star=star, x_px=x_px, y_px=y_px)

@@ -99,7 +99,8 @@ def _jittered(
     attitudes = [propagate(path(t), jitter[k], -1.0) for k, t in enumerate(times_s.tolist())]
     samples = []
     for k, q in enumerate(attitudes):
-        before, after = attitudes[max(k - 1, 0)], attitudes[min(k + 1, count - 1)]
+        before = attitudes[max(k - 1, 0)]
+        after = attitudes[min(k + 1, count - 1)]
         rate = rate_between_rad_s(before, after, (min(k + 1, count - 1) - max(k - 1, 0)) / SEND_HZ)
         samples.append(AttitudeSample(round(times_s[k] * NS_PER_S), q, rate, k))
     return samples
@@ -147,21 +148,21 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
     ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
         wanted = {int(frame_count * part) for part in PICTURES_AT}
-        kept: dict[int, Codes] = {}
+        codes_by_frame: dict[int, Codes] = {}
 
         def sink(shown: Shown) -> None:
             if shown.missing and shows.ready():
                 sender.tend()
             elif not shown.missing and wanted and shown.number >= min(wanted):
                 wanted.remove(min(wanted))
-                kept[shown.number] = bench.code_values(shown.drawn.levels).copy()
+                codes_by_frame[shown.number] = bench.code_values(shown.drawn.levels).copy()
             watch(shown)
 
         link.await_ready()
         summary = serve(
             bench, link, Limit(slots=frame_count, from_first_attitude=True), sink, outlet
         )
-    return Demo(summary, kept, bench.config.monitor.bits)
+    return Demo(summary, codes_by_frame, bench.config.monitor.bits)
 
 
 class _DemoSender(Closing):

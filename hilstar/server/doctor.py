@@ -114,12 +114,15 @@ def examine() -> Examination:
         Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False),
         _cameras(),
     ]
-    outputs = [
-        OutputReport(
-            state.line(), [finding.text for finding in findings(state, USUAL_BITS)], state.fields()
+    outputs = []
+    for state in lit_outputs():
+        outputs.append(
+            OutputReport(
+                state.line(),
+                [finding.text for finding in findings(state, USUAL_BITS)],
+                state.fields(),
+            )
         )
-        for state in lit_outputs()
-    ]
     return Examination(all(check.ok for check in checks if check.required), checks, outputs)
 
 
@@ -146,11 +149,12 @@ class BenchReport:
 
     def keys(self) -> dict[str, Any]:
         """By the keys of `doctor --json`."""
-        now, told = self.monitor.now, {"fault": self.monitor.fault, "notice": self.monitor.notice}
+        now = self.monitor.now
+        monitor_notes = {"fault": self.monitor.fault, "notice": self.monitor.notice}
         return {
             **self.fields.keys(),
             "star": self.star.keys(),
-            **({} if now is None else {"monitor": {TABLE: now.known(), **told}}),
+            **({} if now is None else {"monitor": {TABLE: now.known(), **monitor_notes}}),
         }
 
     def lines(self, name: str) -> Iterator[str]:
@@ -159,7 +163,8 @@ class BenchReport:
         # a name of any length stands apart from the text
         yield f"{state:8}{name + ' ':12}{self.fields.line()}"
         yield f"{'check' if self.star.too_wide else 'ok':8}{'star':12}{self.star.line()}"
-        fault, remedy = self.star.fault(), self.star.would_do
+        fault = self.star.fault()
+        remedy = self.star.would_do
         if fault is not None and remedy is not None:
             yield from (f"{'':20}{line}" for line in (fault, *remedy.lines()))
         if self.monitor.now is not None:
@@ -185,8 +190,12 @@ def examine_bench(path: Path | None, today: datetime.date) -> dict[str, BenchRep
 
 def _report_on(file: BenchFile, today: datetime.date) -> BenchReport:
     now = identity_here(file.config.monitor.display)
-    check = MonitorCheck(None) if now is None else check_monitor(file, now, today)
-    config, folder = file.config, file.folder
+    if now is None:
+        check = MonitorCheck(None)
+    else:
+        check = check_monitor(file, now, today)
+    config = file.config
+    folder = file.folder
     return BenchReport(
         fields_of_view(config, folder),
         star_size(config, folder, bench_camera(config, folder)),
@@ -246,17 +255,17 @@ def _catalogue() -> str:
 
 
 def _gpus() -> Check:
-    found = gpus()
+    listed = gpus()
     leave_contexts()
     try:
         window = window_renderer()
     except MachineError:
         window = ""
-    headless = "; ".join(gpu.line() for gpu in found) or "EGL lists none"
+    headless = "; ".join(gpu.line() for gpu in listed) or "EGL lists none"
     detail = f"headless {headless}; window {window or 'none'}"
-    if window and found and window != found[0].renderer:
+    if window and listed and window != listed[0].renderer:
         detail += " (another than headless: [render] gpu chooses)"
-    return Check("gpu", any(gpu.renderer for gpu in found), detail, required=False)
+    return Check("gpu", any(gpu.renderer for gpu in listed), detail, required=False)
 
 
 LOOKS: dict[str, Callable[[], str]] = {
@@ -273,11 +282,13 @@ LOOKS: dict[str, Callable[[], str]] = {
 def row() -> dict[str, str]:
     """This machine's cells by their columns; the last is for who measured."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("moderngl", "glfw"))
-    own = f"{__version__}; Python {platform.python_version()}, ZeroMQ {zmq_version()}, {packages}"
-    links = "; ".join(
-        ["ZeroMQ and UDP over loopback", *(f"serial {words}" for words in adapters())]
+    versions_text = (
+        f"{__version__}; Python {platform.python_version()}, ZeroMQ {zmq_version()}, {packages}"
     )
-    cells = (own, _machine(), _opengl(), _display_server(), _monitors(), links, TO_FILL)
+    links = "; ".join(
+        ["ZeroMQ and UDP over loopback", *(f"serial {adapter_text}" for adapter_text in adapters())]
+    )
+    cells = (versions_text, _machine(), _opengl(), _display_server(), _monitors(), links, TO_FILL)
     return {
         name: " ".join(text.split()).replace("|", "/")
         for name, text in zip(COLUMNS, cells, strict=True)
@@ -314,11 +325,13 @@ def _opengl() -> str:
     except (HilstarError, OSError) as error:
         return f"{NOT_THERE}: {error}"
     try:
-        found = f"{context.info['GL_RENDERER']}, OpenGL {context.info['GL_VERSION']}"
+        driver_text = f"{context.info['GL_RENDERER']}, OpenGL {context.info['GL_VERSION']}"
     finally:
         context.release()
     drivers = ", ".join(dict.fromkeys(_cards()))
-    return f"{found}; kernel driver {drivers}" if drivers else found
+    if drivers:
+        return f"{driver_text}; kernel driver {drivers}"
+    return driver_text
 
 
 def _cards() -> Iterator[str]:
@@ -333,13 +346,14 @@ def _cards() -> Iterator[str]:
 
 def _display_server() -> str:
     session = os.environ.get("XDG_SESSION_TYPE", "")
-    found = ""
+    server_text = ""
     with contextlib.suppress(OSError):
-        found = server_of()
-    wayland = (
-        "a Wayland session" if os.environ.get("WAYLAND_DISPLAY") or session == "wayland" else ""
-    )
-    return ", ".join(part for part in (found, wayland) if part) or NOT_THERE
+        server_text = server_of()
+    if os.environ.get("WAYLAND_DISPLAY") or session == "wayland":
+        wayland = "a Wayland session"
+    else:
+        wayland = ""
+    return ", ".join(part for part in (server_text, wayland) if part) or NOT_THERE
 
 
 def _monitors() -> str:

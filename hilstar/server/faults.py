@@ -76,7 +76,8 @@ class FaultStream:
     ) -> None:
         self.messages = 0
         self.refused: Counter[str] = Counter()
-        self._schedule, self._notices = schedule, options.get("notices") or Notices()
+        self._schedule = schedule
+        self._notices = options.get("notices") or Notices()
         options |= {"notices": self._notices, "max_part_bytes": MAX_MESSAGE_BYTES}
         self._link = ZmqReceiver(endpoint, **options)
         self._allowance = Allowance(MAX_BURST, MAX_PER_S)
@@ -92,8 +93,8 @@ class FaultStream:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                for each in self._link.taken(POLL_MS):
-                    self._take(each.host_ns, each.parts[-1])
+                for message in self._link.taken(POLL_MS):
+                    self._take(message.host_ns, message.parts[-1])
             except Exception as error:  # whatever it is: the run goes on, and so does this
                 self._notices.tell(
                     "fault-stream",
@@ -156,12 +157,14 @@ def read_recording(path: Path, records: Sequence[FaultRecord] | None = None) -> 
     Raises InputError for damage, and for a measured map that is not the run's any more.
     """
     faults: dict[int, Fault] = {}
-    seed, folder = 0, Path()
+    seed = 0
+    folder = Path()
     records = tuple(fault_records(path) if records is None else records)
     for record in records:
         if record.event != "start":
             continue
-        seed, folder = record.seed, Path(record.folder)
+        seed = record.seed
+        folder = Path(record.folder)
         try:
             faults[record.number] = fault = fault_of(msgspec.json.decode(record.table))
         except (*NOT_JSON, InputError) as error:
@@ -183,7 +186,9 @@ class RunFaults:
     def __init__(
         self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None
     ) -> None:
-        self._scenario, self._notices, self._ledger = scenario, notices, ledger
+        self._scenario = scenario
+        self._notices = notices
+        self._ledger = ledger
         self._started: Counter[str] = Counter()
         self._missed: Counter[str] = Counter()
         self._stream: FaultStream | None = None
@@ -204,10 +209,16 @@ class RunFaults:
 
     def _hear(self, change: FaultChange) -> None:
         fault = change.fault
-        tally = self._missed if change.what == "missed" else self._started
+        if change.what == "missed":
+            tally = self._missed
+        else:
+            tally = self._started
         if change.what != "end":
             tally[fault.name if len(tally) < MAX_NAMES or fault.name in tally else "others"] += 1
-        person = "" if change.who in {FILE, STREAM} else change.who
+        if change.who in {FILE, STREAM}:
+            person = ""
+        else:
+            person = change.who
         self._notices.tell(
             "fault",
             f"fault {fault.name} ({fault.KIND}) {WORDS[change.what]}, by {change.who}",
@@ -218,14 +229,18 @@ class RunFaults:
             record = self._record(
                 change.what, table, name=fault.name, kind=fault.KIND, who=change.who
             )
-            record.number, record.t_ns = change.number, change.t_ns
+            record.number = change.number
+            record.t_ns = change.t_ns
             record.file_sha256 = self._sha256.get(fault, "")
             self._ledger.fault(record)
 
     def _record(
         self, event: str, table: str, name: str, kind: str = "", who: str = ""
     ) -> FaultRecord:
-        folder = str(self._scenario.folder.resolve()) if self._scenario.faults else ""
+        if self._scenario.faults:
+            folder = str(self._scenario.folder.resolve())
+        else:
+            folder = ""
         return FaultRecord(
             host_ns=time.monotonic_ns(),
             event=event,
@@ -276,7 +291,9 @@ class RunFaults:
             "dropped_frames": self.frames.dropped,
             "frozen_frames": self.frames.frozen,
         }
-        return told if self._stream is None else told | {"stream": self._stream.summary()}
+        if self._stream is None:
+            return told
+        return told | {"stream": self._stream.summary()}
 
 
 class ReplayedFaults:

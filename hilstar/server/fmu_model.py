@@ -70,7 +70,10 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         made = json.loads(Path(__file__).with_name("bench.json").read_text())
         self.address: str = made["address"]
         self.real_time = self.use_rate = True
-        self.q_w, self.q_x, self.q_y, self.q_z = 1.0, 0.0, 0.0, 0.0
+        self.q_w = 1.0
+        self.q_x = 0.0
+        self.q_y = 0.0
+        self.q_z = 0.0
         self.rate_x = self.rate_y = self.rate_z = 0.0
         self.t_s = COMMUNICATION_POINT
         self.frame = self.health = self.statuses = self.answers = 0
@@ -95,15 +98,16 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             Boolean("use_rate", description="the rate inputs are connected", **parameter)
         )
         for name in (*Q, *RATE, "t_s"):
-            words = "s: time of the attitude, -1 for that of the communication point"
+            description = "s: time of the attitude, -1 for that of the communication point"
             if name != "t_s":
-                words = (
-                    "q_icrs_to_cam, scalar first, Hamilton"
-                    if name in Q
-                    else "rad/s: rate of cam, its own components"
-                )
-            self.register_variable(Real(name, causality=Fmi2Causality.input, description=words))
-        for name, words in (
+                if name in Q:
+                    description = "q_icrs_to_cam, scalar first, Hamilton"
+                else:
+                    description = "rad/s: rate of cam, its own components"
+            self.register_variable(
+                Real(name, causality=Fmi2Causality.input, description=description)
+            )
+        for name, description in (
             ("frame", "number of the newest frame that was shown, mod 2^31"),
             ("health", "sum of hilstar's health bits"),
             ("statuses", "status packets so far: 0 while no display answers"),
@@ -112,12 +116,19 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             discrete = Fmi2Variability.discrete
             self.register_variable(
                 Integer(
-                    name, causality=Fmi2Causality.output, variability=discrete, description=words
+                    name,
+                    causality=Fmi2Causality.output,
+                    variability=discrete,
+                    description=description,
                 )
             )
         for name in ANSWERED:
-            words = "attitude of the tracker's newest valid answer, q_icrs_to_cam; zeros before one"
-            self.register_variable(Real(name, causality=Fmi2Causality.output, description=words))
+            description = (
+                "attitude of the tracker's newest valid answer, q_icrs_to_cam; zeros before one"
+            )
+            self.register_variable(
+                Real(name, causality=Fmi2Causality.output, description=description)
+            )
         self.register_variable(
             Real(
                 "answered_t_s",
@@ -139,9 +150,9 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
     def exit_initialization_mode(self) -> None:
         """Open the socket, and listen."""
         host, _, port = self.address.rpartition(":")
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
-        self._socket = socket.socket(found[0][0], socket.SOCK_DGRAM)
-        self._socket.connect(found[0][4])
+        addresses = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
+        self._socket = socket.socket(addresses[0][0], socket.SOCK_DGRAM)
+        self._socket.connect(addresses[0][4])
         self._socket.settimeout(LISTEN_S)
         threading.Thread(
             target=self._listen, args=(self._socket,), name="hilstar-fmu", daemon=True
@@ -149,10 +160,8 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Send the attitude of this communication point; in real time, wait for the next."""
-        q, rate = (
-            tuple(getattr(self, name) for name in Q),
-            tuple(getattr(self, name) for name in RATE),
-        )
+        q = tuple(getattr(self, name) for name in Q)
+        rate = tuple(getattr(self, name) for name in RATE)
         if not abs(math.hypot(*q) - 1.0) <= protocol.NORM_TOLERANCE or not all(
             map(math.isfinite, rate)
         ):
@@ -162,7 +171,10 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             )
             self.log(line, Fmi2Status.error)
             return False
-        t_s = current_time if self.t_s == COMMUNICATION_POINT else self.t_s
+        if self.t_s == COMMUNICATION_POINT:
+            t_s = current_time
+        else:
+            t_s = self.t_s
         t_ns = round(t_s * NS_PER_S)
         if self._zero is None:
             self._zero = t_ns, time.monotonic_ns()
@@ -181,7 +193,8 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
 
     def terminate(self) -> None:
         """Close the socket."""
-        opened, self._socket = self._socket, None
+        opened = self._socket
+        self._socket = None
         if opened is not None:
             opened.close()
 

@@ -46,7 +46,9 @@ class FrameFeed(Closing):
     ) -> None:
         self.sent = self.skipped = 0
         self.endpoint = sender.endpoint
-        self._sender, self._bench, self._swap_to_light_ns = sender, bench, swap_to_light_ns
+        self._sender = sender
+        self._bench = bench
+        self._swap_to_light_ns = swap_to_light_ns
         self._rgb = bench.calibration.response.rgb
         self._free: queue.SimpleQueue[_Copied] = queue.SimpleQueue()
         self._full: queue.SimpleQueue[_Copied | None] = queue.SimpleQueue()
@@ -60,7 +62,8 @@ class FrameFeed(Closing):
         """Take a frame. Called by the frame loop."""
         if not self.watched:
             return
-        levels, monitor = shown.drawn.levels, self._bench.config.monitor
+        levels = shown.drawn.levels
+        monitor = self._bench.config.monitor
         try:
             copied = self._free.get_nowait()
         except queue.Empty:
@@ -90,7 +93,8 @@ class FrameFeed(Closing):
     def _attitude(self, shown: Shown) -> tuple[float, float, float, float] | None:
         if shown.attitude is None:
             return None
-        q, rate = shown.attitude.q_icrs_to_cam, shown.drawn.rate_cam_rad_s
+        q = shown.attitude.q_icrs_to_cam
+        rate = shown.drawn.rate_cam_rad_s
         w, x, y, z = (
             q if rate is None else propagate(q, rate, self._bench.scan.hold_s / 2)
         ).tolist()
@@ -141,10 +145,13 @@ def lit_pixels(levels: npt.NDArray[np.unsignedinteger[Any]]) -> npt.NDArray[np.i
     time where few are.
     """
     flat = levels.ravel()
-    each = WORD_BYTES // flat.itemsize
-    whole = len(flat) // each * each
+    pixels_a_word = WORD_BYTES // flat.itemsize
+    whole = len(flat) // pixels_a_word * pixels_a_word
     words = np.flatnonzero(flat[:whole].view(np.uint64))
     near = np.concatenate(
-        [(words[:, None] * each + np.arange(each)).ravel(), np.arange(whole, len(flat))]
+        [
+            (words[:, None] * pixels_a_word + np.arange(pixels_a_word)).ravel(),
+            np.arange(whole, len(flat)),
+        ]
     )
     return np.asarray(near[flat[near] > 0])

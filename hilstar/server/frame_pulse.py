@@ -40,15 +40,14 @@ class FramePulse(Closing):
         self._pulse_ns = round(settings.pulse_ms * NS_PER_MS)
         self._every = settings.every_frames
         self._notices = notices
-        self._wanted, self._taken, self._idle = (
-            threading.Event(),
-            threading.Event(),
-            threading.Event(),
-        )
+        self._wanted = threading.Event()
+        self._taken = threading.Event()
+        self._idle = threading.Event()
         self._idle.set()
         self._frame_ns = 0
         self._ends = False
-        self._delay_ms, self._line_ms = RunningStatistics(), RunningStatistics()
+        self._delay_ms = RunningStatistics()
+        self._line_ms = RunningStatistics()
         self._counts: Counter[str] = Counter()
         self.counted: Callable[[str], None] = lambda what: None
         self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, HOST_CLOCK)
@@ -133,7 +132,8 @@ class FramePulse(Closing):
     def summary(self) -> SyncSummary:
         """The pulses so far, with one that lasts."""
         self._idle.wait(LAST_S)
-        delay, line = self._delay_ms, self._line_ms
+        delay = self._delay_ms
+        line = self._line_ms
         return SyncSummary(
             port=self._line.port,
             pulses=delay.count,

@@ -69,15 +69,19 @@ class HeadProcess:
         self.code: int | None = None  # None before its end
         self.output = b""  # what it wrote to stdout, the last time
         # not on a command line, which all users see
-        self._command, self._say, self._secrets = command, say, secrets
+        self._command = command
+        self._say = say
+        self._secrets = secrets
         self._address = str(life)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.bind(self._address)
         self._socket.setblocking(False)
-        self._back_off_s, self._again_at_s = MIN_BACK_OFF_S, 0.0
+        self._back_off_s = MIN_BACK_OFF_S
+        self._again_at_s = 0.0
         self._process: subprocess.Popen[bytes] | None = None
         self._readers: list[threading.Thread] = []
-        self._ready, self._first_ready_s = False, 0.0
+        self._ready = False
+        self._first_ready_s = 0.0
         self._begin()
 
     def _begin(self) -> None:
@@ -88,7 +92,8 @@ class HeadProcess:
             "WATCHDOG_USEC": str(int(STALLED_S * US_PER_S)),
         }
         self._drain()  # what the last one still said
-        self._ready, self._begun_s = False, time.monotonic()
+        self._ready = False
+        self._begun_s = time.monotonic()
         self._heard_s = self._begun_s
         self._process = subprocess.Popen(
             list(self._command(self.restarts, self.drawn_s)),
@@ -119,9 +124,9 @@ class HeadProcess:
         heard = False
         with contextlib.suppress(BlockingIOError):
             while True:
-                said = self._socket.recv(4096)
+                line_bytes = self._socket.recv(4096)
                 heard = True
-                if b"READY=1" in said:
+                if b"READY=1" in line_bytes:
                     self._ready = True
                     self._first_ready_s = self._first_ready_s or time.monotonic()
         return heard
@@ -129,7 +134,9 @@ class HeadProcess:
     @property
     def drawn_s(self) -> float:
         """How long ago it drew its first frame, 0 where it never did."""
-        return time.monotonic() - self._first_ready_s if self._first_ready_s else 0.0
+        if self._first_ready_s:
+            return time.monotonic() - self._first_ready_s
+        return 0.0
 
     def tend(self) -> bool:
         """Begin it again where it ended in error or stalled; whether it still has something to
@@ -165,7 +172,10 @@ class HeadProcess:
         if 0 <= code <= 4 and (self._ready or code != 0):
             self.code = code
             return False
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        if code < 0:
+            how = f"signal {-code}"
+        else:
+            how = f"exit code {code}"
         self._say(f"{self.name}: its process ended ({how}); it is started again")
         self._wait_to_begin(now_s)
         return True
@@ -236,9 +246,9 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
     with temporary_folder("heads") as folder, stop_on_signal(stop):
         endpoint = f"ipc://{folder}/{SOCKET}"
         with Feed(endpoint) as feed:
-            processes = [
-                _head(asked, k, endpoint, folder, say) for k in range(len(asked.heads.names))
-            ]
+            processes = []
+            for k in range(len(asked.heads.names)):
+                processes.append(_head(asked, k, endpoint, folder, say))
             try:
                 _hand_on(link, feed, processes, stop)
                 for process in processes:
@@ -250,7 +260,8 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
 
 
 def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> HeadProcess:
-    name, file = asked.heads.names[k], asked.heads.files[k]
+    name = asked.heads.names[k]
+    file = asked.heads.files[k]
 
     def command(number: int, drawn_s: float) -> list[str]:
         made = [sys.executable, "-m", "hilstar", "serve", str(file.path), "--json"]
@@ -269,7 +280,10 @@ def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> Hea
             made += ["--console", asked.consoles[k]]
         return made
 
-    secrets = {} if asked.token is None else {"HILSTAR_TOKEN": asked.token}
+    if asked.token is None:
+        secrets = {}
+    else:
+        secrets = {"HILSTAR_TOKEN": asked.token}
     return HeadProcess(name, command, say, folder / f"life-{k}", secrets)
 
 
@@ -296,5 +310,8 @@ def _hand_on(
 def _told(process: HeadProcess) -> dict[str, Any]:
     summary = None
     with contextlib.suppress(*NOT_JSON):
-        summary = msgspec.json.decode(process.output) if process.output.strip() else None
+        if process.output.strip():
+            summary = msgspec.json.decode(process.output)
+        else:
+            summary = None
     return {"exit_code": process.code, "restarts": process.restarts, "summary": summary}

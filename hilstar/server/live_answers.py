@@ -58,14 +58,19 @@ class LiveAnswers:
         self.heard: Callable[[LiveAnswers], None] = lambda answers: None
         # called with each, as it is judged
         self.passed_on: Callable[[Answer, int], None] = lambda answer, middle_ns: None
-        self._source, self._notices, self._ledger, self._clock = source, notices, ledger, clock
+        self._source = source
+        self._notices = notices
+        self._ledger = ledger
+        self._clock = clock
         self._light_ns = 0 if screen is None else screen.swap_to_light_ns
         self._on_screen = screen is not None
         period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
         self._judge = AnswerJudge(rules, self._frames)
         self._allowance = Allowance(MAX_JUDGED_HZ, MAX_JUDGED_HZ)
-        self._too_many, self._figures_ns, self._untold = 0, 0, False
+        self._too_many = 0
+        self._figures_ns = 0
+        self._untold = False
         self._unread, self._unread_ns = "", 0  # the reader's, the newest, and when it lasted still
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-answers", daemon=True)
@@ -74,10 +79,17 @@ class LiveAnswers:
         """Take a frame whose light leaves at `light_ns` of the sender's clock. Called by the
         frame loop.
         """
-        attitude, on_screen = shown.attitude, shown.on_screen
-        seen = attitude is not None and not on_screen.operator and not on_screen.hidden
-        host_ns = shown.swap_ns + self._light_ns if self._on_screen else shown.draw_ns
-        q = attitude.q_icrs_to_cam if attitude is not None and seen else None
+        attitude = shown.attitude
+        on_screen = shown.on_screen
+        is_visible = attitude is not None and not on_screen.operator and not on_screen.hidden
+        if self._on_screen:
+            host_ns = shown.swap_ns + self._light_ns
+        else:
+            host_ns = shown.draw_ns
+        if attitude is not None and is_visible:
+            q = attitude.q_icrs_to_cam
+        else:
+            q = None
         self._frames.add(LitFrame(shown.number, host_ns, light_ns, q, shown.drawn.rate_cam_rad_s))
 
     @contextmanager
@@ -128,7 +140,8 @@ class LiveAnswers:
         """
         reason = self._source.unread
         if reason:
-            self._unread, self._unread_ns = reason, now_ns
+            self._unread = reason
+            self._unread_ns = now_ns
         unread = bool(self._unread) and now_ns - self._unread_ns < AGAIN_NS
         if figures.silent and unread:  # the tracker may well answer
             figures = msgspec.structs.replace(figures, silent=f"no answer is read: {self._unread}")
@@ -171,7 +184,8 @@ class LiveAnswers:
 def wrong_line(judged: Judged) -> str:
     """What is said of a wrong answer: how far it is off, and in which frames."""
     assert judged.residual is not None and judged.lit is not None
-    off, lit = math.hypot(*judged.residual), judged.lit
+    off = math.hypot(*judged.residual)
+    lit = judged.lit
     unit, scale, digits = ("arcsec", 1.0, 0) if off < 3600 else ("deg", 3600.0, 2)
     parts = ", ".join(
         f"{axis} {part / scale:.{digits}f}"

@@ -72,7 +72,8 @@ class FaultyFrames:
     def __init__(self, source: Callable[[int], tuple[Now, ...]], view: FaultView) -> None:
         self.dropped = self.frozen = 0
         self.now: tuple[Now, ...] = ()  # faults of the last frame that was asked about
-        self._source, self._view = source, view
+        self._source = source
+        self._view = view
         self._held: Held | None = None
 
     def at(self, t_ns: int, attitude: Attitude | None) -> FaultLayer | None:
@@ -99,11 +100,9 @@ class FaultyFrames:
             return attitude
         if effects.frozen and self._held is not None:
             held = self._held.attitude
-            return (
-                None
-                if held is None
-                else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
-            )
+            if held is None:
+                return None
+            return replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
         if effects.blank:
             return None
         turned = effects.turned(View(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s))
@@ -131,9 +130,15 @@ class FaultyFrames:
         """
         now = () if effects is None else effects.now
         if stays and self._held is not None:
-            return (*self._held.now, *(one for one in now if isinstance(one.fault, Freeze)))
+            return (
+                *self._held.now,
+                *(active for active in now if isinstance(active.fault, Freeze)),
+            )
         self._held = Held(
-            drawn, attitude, t_ns, tuple(one for one in now if not isinstance(one.fault, Freeze))
+            drawn,
+            attitude,
+            t_ns,
+            tuple(active for active in now if not isinstance(active.fault, Freeze)),
         )
         return now
 
@@ -155,8 +160,11 @@ class FrameLoop:
         notices: Notices | None = None,
         faults: FaultyFrames | None = None,
     ) -> None:
-        settings, motion = bench.config.attitude, bench.config.render.motion
-        self._bench, self._sink, self._faults = bench, sink, faults
+        settings = bench.config.attitude
+        motion = bench.config.render.motion
+        self._bench = bench
+        self._sink = sink
+        self._faults = faults
         self._period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         self._blank_when_stale = settings.on_stale == "blank"
         self.pacer = Pacer(self._period_ns) if pacer is None else pacer
@@ -171,7 +179,10 @@ class FrameLoop:
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
         self.notices = Notices() if notices is None else notices
         # The turn that is told of; a bench that leaves nothing to its tolerance has no claim.
-        claimed_deg_s = bench.effort.claimed_turn_deg_s if bench.effort.is_chosen else 0.0
+        if bench.effort.is_chosen:
+            claimed_deg_s = bench.effort.claimed_turn_deg_s
+        else:
+            claimed_deg_s = 0.0
         self._told_above_deg_s = SHAKEN * claimed_deg_s or math.inf
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
@@ -280,7 +291,10 @@ class FrameLoop:
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         # Never two in a row, so that even a machine too slow for its display shows something.
-        late_ns = 0 if moment.due_ns is None else self.pacer.clock.now_ns() - moment.due_ns
+        if moment.due_ns is None:
+            late_ns = 0
+        else:
+            late_ns = self.pacer.clock.now_ns() - moment.due_ns
         if late_ns <= GIVEN_UP_PERIODS * self._period_ns or not moment.may_be_given_up:
             return False
         self.tally.given_up_frames += 1
@@ -289,7 +303,8 @@ class FrameLoop:
         return True
 
     def _count(self, shown: Shown, on_screen: OnScreen) -> None:
-        drawn, attitude = shown.drawn, shown.attitude
+        drawn = shown.drawn
+        attitude = shown.attitude
         age_ns = None if attitude is None else attitude.age_ns
         self.tally.add(shown.swap_ns - shown.draw_ns, age_ns, drawn.star_count, drawn.clipped_hip)
         if self.tally.first_swap_ns is None:
@@ -307,7 +322,10 @@ class FrameLoop:
                 )
             self.tally.capped_frames += 1
         if shown.predicted_swap_ns is not None:
-            received_ns = None if attitude is None else attitude.received_ns
+            if attitude is None:
+                received_ns = None
+            else:
+                received_ns = attitude.received_ns
             self.tally.swaps.add(
                 shown.swap_ns, shown.predicted_swap_ns, shown.missed_before, received_ns
             )

@@ -79,7 +79,10 @@ def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -
     rates = DifferenceRates(
         round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s)
     )
-    name = None if settings.spacecraft is None else str(settings.spacecraft)
+    if settings.spacecraft is None:
+        name = None
+    else:
+        name = str(settings.spacecraft)
     mounting = Mounting(config.tracker.q_body_to_cam)
     taken: StateUse = (
         "state" if from_source(config) else "velocity" if settings.use_velocity else "attitude"
@@ -92,7 +95,9 @@ def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -
     broadcast = vizard_broadcast(
         settings.address, follower, bind=settings.bind is True, notices=notices
     )
-    return ZmqApart(broadcast, notices) if apart else broadcast
+    if apart:
+        return ZmqApart(broadcast, notices)
+    return broadcast
 
 
 def _open_42(config: BenchConfig, notices: Notices | None) -> AnyLink:

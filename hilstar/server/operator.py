@@ -27,7 +27,9 @@ class Aids:
     """Switches that cover or stop the sky. Written by the frame loop's thread alone."""
 
     def __init__(self) -> None:
-        self.paused, self._overlay, self._patch = False, 0, -1
+        self.paused = False
+        self._overlay = 0
+        self._patch = -1
 
     @property
     def overlay(self) -> int:
@@ -60,7 +62,9 @@ class Aids:
         """Whether a switch is on."""
         if name == "pause":
             return self.paused
-        return self._patch >= 0 if name == "patch" else bool(self._overlay & _BITS[name])
+        if name == "patch":
+            return self._patch >= 0
+        return bool(self._overlay & _BITS[name])
 
     def set(self, name: str, on: bool, share: float = 1.0) -> None:
         """Turn a switch; a patch shows the nearest to `share` of white."""
@@ -135,13 +139,17 @@ class Operator:
         requests: SwitchRequests | None = None,
         levels: AidLevels | None = None,
     ) -> None:
-        self.aids, self._notices, self._hidden, self._levels = aids, notices, hidden, levels
+        self.aids = aids
+        self._notices = notices
+        self._hidden = hidden
+        self._levels = levels
         self._requests = deque() if requests is None else requests
         self._told = HEADLESS
         # what a paused screen shows, and the time that it was for
         self._held: tuple[Attitude, int] | None = None
         self._last_swap_ns: int | None = None
-        self._frames, self._lasted_ns = {"operator": 0, "hidden": 0}, {"operator": 0, "hidden": 0}
+        self._frames = {"operator": 0, "hidden": 0}
+        self._lasted_ns = {"operator": 0, "hidden": 0}
 
     def look(self) -> OnScreen:
         """State of the switches and the window now, once what was requested is done. Reports
@@ -161,7 +169,8 @@ class Operator:
                 request.done = True
         now = OnScreen(self.aids.text, self._hidden(), self.aids.shows_sky)
         if now != self._told:
-            before, self._told = self._told, now
+            before = self._told
+            self._told = now
             if now.operator != before.operator:
                 self._notices.tell("operator", f"operator's keys: {now.operator or SKY_AGAIN}")
             if now.hidden and now.hidden != before.hidden:
@@ -189,15 +198,16 @@ class Operator:
 
     def laid_over(self, levels: Levels) -> Levels:
         """The levels of a frame that no screen changes, with the aids over them."""
-        return (
-            levels
-            if self._levels is None
-            else self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)
-        )
+        if self._levels is None:
+            return levels
+        return self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)
 
     def count(self, shown: OnScreen, swap_ns: int) -> None:
         """Count a frame by how it was shown."""
-        since_ns = 0 if self._last_swap_ns is None else swap_ns - self._last_swap_ns
+        if self._last_swap_ns is None:
+            since_ns = 0
+        else:
+            since_ns = swap_ns - self._last_swap_ns
         self._last_swap_ns = swap_ns
         for name, lasts in (("operator", shown.operator), ("hidden", shown.hidden)):
             if lasts:

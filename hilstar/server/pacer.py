@@ -38,7 +38,9 @@ class Moment:
 
     def light_if_begun_at(self, host_ns: int) -> int:
         """When the light of the frame leaves if it is begun at `host_ns`."""
-        return host_ns if self.light_ns is None else self.light_ns
+        if self.light_ns is None:
+            return host_ns
+        return self.light_ns
 
     @property
     def starts_ns(self) -> int | None:

@@ -31,9 +31,11 @@ class Pointing:
     """Tells of a run's first attitude, while this is open. `see` costs a frame one comparison."""
 
     def __init__(self, bench: Bench, notices: Notices) -> None:
-        self._bench, self._notices = bench, notices
+        self._bench = bench
+        self._notices = notices
         self._q_icrs_to_cam: FloatArray | None = None
-        self._come, self._closed = threading.Event(), False
+        self._come = threading.Event()
+        self._closed = False
         self._thread = threading.Thread(target=self._run, name="hilstar-pointing", daemon=True)
 
     def see(self, shown: Shown) -> None:
@@ -64,7 +66,8 @@ def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
     tracker's field.
     """
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q_icrs_to_cam)
-    ra, roll = turn_text(ra_deg, 3), turn_text(roll_deg, 3)
+    ra = turn_text(ra_deg, 3)
+    roll = turn_text(roll_deg, 3)
     text = f"the first attitude points at RA {ra}, Dec {dec_deg:+.3f}, roll {roll} deg"
     matrix = to_matrix(q_icrs_to_cam)
     star = _brightest_in_view(bench, matrix)
@@ -72,10 +75,10 @@ def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
         return f"{text}, in {constellation_of(matrix[2])}, where the catalogue has no star in view"
     stars = bench.stars
     designation, name = star_names().get(int(stars.hip[star]), ("", ""))
-    words = [part for part in (name, designation) if part] or [
+    names = [part for part in (name, designation) if part] or [
         str(stars.designations(np.array([star]))[0])
     ]
-    called = printable(", ".join(f"HIP {word}" if word.isdecimal() else word for word in words))
+    called = printable(", ".join(f"HIP {word}" if word.isdecimal() else word for word in names))
     where = constellation_of(np.asarray(stars.vectors[star]))
     return f"{text}; the brightest star in view is {called}, V {stars.v_mag[star]:.2f}, in {where}"
 
@@ -84,7 +87,8 @@ def _brightest_in_view(bench: Bench, matrix: FloatArray) -> int | None:
     """The place of the brightest star of the catalogue in the tracker's field; None where none
     is there.
     """
-    tracker, stars = bench.config.tracker, bench.stars
+    tracker = bench.config.tracker
+    stars = bench.stars
     width, height = (
         0.5 * pixels * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
         for pixels in tracker.resolution_px
@@ -97,4 +101,6 @@ def _brightest_in_view(bench: Bench, matrix: FloatArray) -> int | None:
         & (np.abs(y) <= height * z)
         & np.isfinite(stars.v_mag[:fixed])
     )
-    return int(inside[stars.v_mag[inside].argmin()]) if len(inside) else None
+    if len(inside):
+        return int(inside[stars.v_mag[inside].argmin()])
+    return None

@@ -92,7 +92,9 @@ class DrawnBy:
         if self == other:
             return 0.0
         by_numpy = (self.path == "NumPy") != (other.path == "NumPy")
-        return OTHER_CODES_BY_NUMPY if by_numpy else QUANTISERS[quantisation].other_codes
+        if by_numpy:
+            return OTHER_CODES_BY_NUMPY
+        return QUANTISERS[quantisation].other_codes
 
 
 class PlayedFrame(NamedTuple):
@@ -150,15 +152,17 @@ def played_again(
 
     They are read as they are played, in order, so that memory does not grow with the run.
     """
-    frames, at = read(), -1
+    frames = read()
+    at = -1
     past = first = next(read())
 
     def frame(slot: int) -> PlayedFrame:
         nonlocal at, past
         while at < slot:
-            if (found := next(frames, None)) is None:
+            if (next_frame := next(frames, None)) is None:
                 raise InputError("the ledger became shorter while it was replayed; replay it again")
-            past, at = found, at + 1
+            past = next_frame
+            at = at + 1
         if past.q is None:
             return PlayedFrame(past.frame, past.t_ns, None, past)
         rate, velocity, place = (
@@ -214,8 +218,8 @@ def plan_play(
     play = Play(
         frame, count, len(timeline), not math.isinf(wanted.speed), first_ns, samples[0].t_ns
     )
-    told = [*read.told, *joins.told, *coarse_lines(samples)]
-    return replace(play, told=told, conventions=read.conventions, span=span_line(samples))
+    notices = [*read.told, *joins.told, *coarse_lines(samples)]
+    return replace(play, told=notices, conventions=read.conventions, span=span_line(samples))
 
 
 def _frame_step_s(log: Path, wanted: Wanted, refresh_hz: float, length_s: float) -> float:
@@ -254,7 +258,9 @@ def _look_through(log: Path, wanted: Wanted, max_rate_rad_s: float) -> PastFrame
         if first is None:
             first = last
         count += _is_wanted(wanted, (last.swap_ns - first.swap_ns) / NS_PER_S)
-    return None if first is None or last is None else PastFrames(first, last, count)
+    if first is None or last is None:
+        return None
+    return PastFrames(first, last, count)
 
 
 def _is_wanted(wanted: Wanted, at_s: float) -> bool:
@@ -265,7 +271,9 @@ def _is_wanted(wanted: Wanted, at_s: float) -> bool:
 
 
 def _plan_run(log: Path, wanted: Wanted, past: PastFrames) -> Play:
-    first, last, count = past.first, past.last, past.count
+    first = past.first
+    last = past.last
+    count = past.count
     if wanted.step_s is not None or wanted.speed not in {1.0, math.inf}:
         raise InputError(
             f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no"
@@ -292,10 +300,12 @@ def _plan_run(log: Path, wanted: Wanted, past: PastFrames) -> Play:
         not math.isinf(wanted.speed),
         read_recording(log),
     )
-    head, names = read_head(log), ("gl_renderer", "gl_version", "render_path")
-    drawn_by = (
-        DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
-    )
+    head = read_head(log)
+    names = ("gl_renderer", "gl_version", "render_path")
+    if set(names) <= head.keys():
+        drawn_by = DrawnBy(*(printable(head[name]) for name in names))
+    else:
+        drawn_by = None
     wrong_sky = WrongSky()
     for event in event_records(log):
         wrong_sky.see(event.kind, event.detail, event.host_ns, event.since_ns)
@@ -315,7 +325,10 @@ def _recall_conditions(wrong_sky: WrongSky, past: FrameRecord | None, notices: N
     """Begin and end the conditions of the run that is replayed, as they were at the swap of its
     frame.
     """
-    held = {} if past is None else dict(wrong_sky.at(past.swap_ns))
+    if past is None:
+        held = {}
+    else:
+        held = dict(wrong_sky.at(past.swap_ns))
     for condition in notices.wrong_sky.now():
         if condition.kind not in held:
             notices.end(condition.kind, ENDS[condition.kind], "no more in the run that is replayed")
@@ -336,8 +349,14 @@ def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices)
 
 
 def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
-    start_s = 0.0 if wanted.start_s is None else wanted.start_s
-    stop_s = length_s if wanted.stop_s is None else wanted.stop_s
+    if wanted.start_s is None:
+        start_s = 0.0
+    else:
+        start_s = wanted.start_s
+    if wanted.stop_s is None:
+        stop_s = length_s
+    else:
+        stop_s = wanted.stop_s
     if not 0 <= start_s <= stop_s <= length_s + SAME_S:
         raise InputError(
             f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length,"
@@ -394,7 +413,9 @@ class FrameImages:
     """Writes `frame_000000.png` and on, and `frames.csv`; without a directory it writes nothing."""
 
     def __init__(self, directory: Path | None, bench: Bench) -> None:
-        self._directory, self._bench, self._table = directory, bench, Path()
+        self._directory = directory
+        self._bench = bench
+        self._table = Path()
         self._bits = bench.config.monitor.bits
         self._stack = ExitStack()
 
@@ -404,11 +425,10 @@ class FrameImages:
             return
         path = self._directory / f"frame_{shown.number:06d}.png"
         write_codes_png(path, self._bench.code_values(shown.drawn.levels), self._bits)
-        q = (
-            ["", "", "", ""]
-            if shown.attitude is None
-            else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
-        )
+        if shown.attitude is None:
+            q = ["", "", "", ""]
+        else:
+            q = [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
         row = [
             shown.number,
             f"{shown.t_ns / 1e9:.9f}",

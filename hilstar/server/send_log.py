@@ -56,20 +56,24 @@ class BadCable:
     def __init__(
         self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]
     ) -> None:
-        self.tally, self._faults, self._rng, self._put = SendTally(), faults, rng, put
+        self.tally = SendTally()
+        self._faults = faults
+        self._rng = rng
+        self._put = put
         self._held: bytes | None = None
 
     def delay_s(self) -> float:
         """How late the next packet leaves, uniform up to the jitter."""
-        return (
-            float(self._rng.uniform(0.0, self._faults.jitter_s)) if self._faults.jitter_s else 0.0
-        )
+        if self._faults.jitter_s:
+            return float(self._rng.uniform(0.0, self._faults.jitter_s))
+        return 0.0
 
     def carry(self, packet: bytes) -> None:
         """Send a packet, with its fault if it has one. A packet held back leaves right after the
         next.
         """
-        faults, tally = self._faults, self.tally
+        faults = self._faults
+        tally = self.tally
         dice = self._rng.random()
         if dice < faults.lose:
             tally.lost += 1
@@ -87,14 +91,16 @@ class BadCable:
         tally.sent += 1
         self._put(packet)
         if self._held is not None:
-            held, self._held = self._held, None
+            held = self._held
+            self._held = None
             tally.reordered += 1
             self._put(held)
 
     def close(self) -> None:
         """Send a packet that is still held back; with none after it, it is in order."""
         if self._held is not None:
-            held, self._held = self._held, None
+            held = self._held
+            self._held = None
             self.tally.sent += 1
             self._put(held)
 
@@ -151,17 +157,17 @@ def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSa
             f"--rate {rate_hz:g}: gives {count} packets for this log; write a lower rate"
         )
     resampled = []
-    seen = 0
+    sample_index = 0
     for k in range(count):
         t_ns = samples[0].t_ns + round(k * NS_PER_S / rate_hz)
         attitude = timeline.at(t_ns)
         if attitude is None:
             continue
         broken = False
-        while seen < len(samples) and samples[seen].t_ns <= t_ns:
-            broken |= samples[seen].discontinuity
-            seen += 1
-        rate = _rate_between(samples, seen, t_ns)
+        while sample_index < len(samples) and samples[sample_index].t_ns <= t_ns:
+            broken |= samples[sample_index].discontinuity
+            sample_index += 1
+        rate = _rate_between(samples, sample_index, t_ns)
         resampled.append(
             AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate, discontinuity=broken and k > 0)
         )

@@ -57,7 +57,9 @@ def open_sender(
         raise InputError(
             f"{to}: only ZeroMQ has keys, and a side that connects (--connect); remove them"
         )
-    return UdpSender(to, clock) if line is None else SerialSender(*line, clock)
+    if line is None:
+        return UdpSender(to, clock)
+    return SerialSender(*line, clock)
 
 
 class TwoWay(Closing):
@@ -75,7 +77,8 @@ class TwoWay(Closing):
         send: Callable[[Packet], None],
         clock: Clock,
     ) -> None:
-        self._answered, self._stop = threading.Event(), threading.Event()
+        self._answered = threading.Event()
+        self._stop = threading.Event()
         self._thread = threading.Thread(
             target=self._listen, args=(receive, send, clock), name="hilstar-sender", daemon=True
         )
@@ -157,7 +160,10 @@ class UdpSender(TwoWay):
     def _receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         self._datagrams.wait(timeout_ms)
         taken = self._datagrams.take(MAX_TAKEN)
-        return [Arrival(each.host_ns, decode(each.parts[0]), each.parts[0]) for each in taken]
+        return [
+            Arrival(datagram.host_ns, decode(datagram.parts[0]), datagram.parts[0])
+            for datagram in taken
+        ]
 
     def wait_for_listener(self, timeout_s: float) -> bool:
         """True once hilstar has answered a time request."""
@@ -255,10 +261,8 @@ class Sender(Closing):
         refuse. Only a full serial line is waited for, half a second at most.
         """
         at_ns = self._clock() if t_ns is None else int(t_ns)
-        q, rate = (
-            tuple(map(float, q_icrs_to_cam)),
-            None if rate_cam_rad_s is None else tuple(map(float, rate_cam_rad_s)),
-        )
+        q = tuple(map(float, q_icrs_to_cam))
+        rate = None if rate_cam_rad_s is None else tuple(map(float, rate_cam_rad_s))
         if len(q) != 4 or (rate is not None and len(rate) != 3):
             raise InputError(
                 f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a"

@@ -89,7 +89,10 @@ class Outlet:
         """The frame loop of a run, paced by the screen or else at the bench's own rate; its
         frames start the pulse.
         """
-        faults = None if self.faults is None else self.faults.frames
+        if self.faults is None:
+            faults = None
+        else:
+            faults = self.faults.frames
         if self.screen is not None:
             pacer: Pacer = DisplayPacer(self.screen, self.notices, requests=self.requests)
         else:
@@ -116,7 +119,8 @@ class Outlet:
 
     def complete(self, summary: RunSummary, loop: FrameLoop) -> RunSummary:
         """The summary of a run with its faults, pulses, events and screen."""
-        first_ns, now_ns = loop.tally.first_swap_ns, loop.pacer.clock.now_ns()
+        first_ns = loop.tally.first_swap_ns
+        now_ns = loop.pacer.clock.now_ns()
         wrong_sky = self.notices.wrong_sky.total(now_ns if first_ns is None else first_ns, now_ns)
         return replaced(
             summary,
@@ -151,8 +155,8 @@ def serve(
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     outlet.notices.sum_up()
-    told: dict[str, str | int] = {"endpoint": link.endpoint}
-    return replaced(outlet.complete(summary, loop), link=told | link.link_counts.summary())
+    link_fields: dict[str, str | int] = {"endpoint": link.endpoint}
+    return replaced(outlet.complete(summary, loop), link=link_fields | link.link_counts.summary())
 
 
 def _read_as(bench: Bench, link: AnyLink) -> ReadAs:
@@ -232,12 +236,11 @@ def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_
     offset_ms = receiver.clock_summary().offset_ms
     if answer.q_icrs_to_cam is None or not answer.valid or offset_ms is None:
         return
-    t_ns, rate = middle_ns - round(offset_ms * NS_PER_MS), answer.rate_cam_rad_s
+    t_ns = middle_ns - round(offset_ms * NS_PER_MS)
+    rate = answer.rate_cam_rad_s
     flags = protocol.ANSWER_VALID | (0 if rate is None else protocol.ANSWER_RATE_VALID)
-    q, rates = (
-        tuple(answer.q_icrs_to_cam.tolist()),
-        (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist()),
-    )
+    q = tuple(answer.q_icrs_to_cam.tolist())
+    rates = (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist())
     receiver.back.pass_on(
         AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0)
     )
@@ -253,7 +256,10 @@ class LockstepRun:
     def __init__(self, bench: Bench, limit: Limit, loop: FrameLoop, outlet: Outlet) -> None:
         self.counts = PacketCounts()
         self._last = Shown(0, 0, None, bench.draw(None), missing=True)
-        self._bench, self._limit, self._loop, self._outlet = bench, limit, loop, outlet
+        self._bench = bench
+        self._limit = limit
+        self._loop = loop
+        self._outlet = outlet
         self._clock = loop.pacer.clock
         self._max_rate_rad_s = math.radians(bench.config.attitude.max_rate_deg_s)
 
@@ -265,7 +271,9 @@ class LockstepRun:
         self._rates = RateCheck(
             check, self._loop.notices, used=False, read_as=_read_as(self._bench, link)
         )
-        loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
+        loop = self._loop
+        statuses = StatusMaker(self._outlet.ledger)
+        turn_ms = RunningStatistics()
         self._outlet.follower(Running(loop, self.counts, answers=self._outlet.answers))
         tracker = self._bench.config.tracker
         height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
@@ -299,7 +307,10 @@ class LockstepRun:
     def _take(self, host_ns: int, event: Event, raw: bytes) -> Refusal | None:
         """Show what a request says, or say why it is refused; the last frame then stays."""
         self.counts.received += 1
-        sample = event if isinstance(event, AttitudeSample) else None
+        if isinstance(event, AttitudeSample):
+            sample = event
+        else:
+            sample = None
         refusal = event if isinstance(event, Refusal) else None
         if sample is not None:
             self._rates.see(sample, host_ns)
@@ -342,7 +353,9 @@ class StatusMaker:
     """
 
     def __init__(self, ledger: Ledger | LedgerSwitch | None = None) -> None:
-        self._ledger, self._missed, self._refused = ledger, 0, 0
+        self._ledger = ledger
+        self._missed = 0
+        self._refused = 0
         self._told: dict[str, int] = {}
 
     def status(
@@ -354,8 +367,10 @@ class StatusMaker:
         synchronised: bool,
     ) -> Status:
         """The status after a frame whose light leaves at `light_t_ns` of the sender's clock."""
-        missed, refused = loop.tally.missed_frames, counts.refused
-        attitude, on_screen = shown.attitude, loop.pacer.operator.look()
+        missed = loop.tally.missed_frames
+        refused = counts.refused
+        attitude = shown.attitude
+        on_screen = loop.pacer.operator.look()
         health = {
             protocol.HEALTH_NO_ATTITUDE: shown.missing and not loop.gate.stale,
             protocol.HEALTH_STALE: loop.gate.stale,
@@ -372,7 +387,8 @@ class StatusMaker:
             protocol.HEALTH_SECOND_SENDER: self._happens(loop.notices, "second-sender"),
             protocol.HEALTH_SOURCE_FROZEN: self._happens(loop.notices, "source-frozen"),
         }
-        self._missed, self._refused = missed, refused
+        self._missed = missed
+        self._refused = refused
         return Status(
             health=sum(bit for bit, is_set in health.items() if is_set),
             frame=shown.number,

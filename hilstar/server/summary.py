@@ -52,7 +52,10 @@ def verdict_of(summary: "RunSummary") -> RunVerdict:
     """The verdict on a run. Frames before the first attitude are blank, and are late in nothing."""
     stale = summary.stale_frames - summary.blank_frames
     due = summary.frames - summary.blank_frames + summary.missed_frames
-    late_share = (stale + summary.missed_frames) / due if due else 0.0
+    if due:
+        late_share = (stale + summary.missed_frames) / due
+    else:
+        late_share = 0.0
     wrong = summary.wrong_sky
     reasons = [] if due else ["no frame had an attitude"]
     if summary.missed_frames:
@@ -66,10 +69,13 @@ def verdict_of(summary: "RunSummary") -> RunVerdict:
             f"{summary.blank_frames} of {summary.frames} frames before the first attitude"
         )
     if wrong.seconds:
-        kinds = ", ".join(one.kind for one in wrong.conditions if one.seconds)
+        kinds = ", ".join(condition.kind for condition in wrong.conditions if condition.seconds)
         reasons.append(f"{wrong.seconds:.1f} s of a wrong sky ({kinds})")
     good = not (stale or summary.missed_frames or wrong.seconds) and due > 0
-    head = f"the sky was right in all {due} frames" if good else "the sky was not right throughout"
+    if good:
+        head = f"the sky was right in all {due} frames"
+    else:
+        head = "the sky was not right throughout"
     line = "; ".join([head, *reasons])
     strict = due > 0 and late_share <= MAX_LATE_SHARE and not wrong.seconds
     return RunVerdict(good, strict, round(late_share, 4), wrong.seconds, line)
@@ -201,9 +207,10 @@ class RunTally:
         """What all kinds of run say; figures without a sample are None."""
         stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
         bodies = sorted(body for body in self.clipped_hip if isinstance(body, str))
-        refused_by = {
-            name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS
-        }
+        refused_by = {}
+        for name, n in counts.refused_by.items():
+            if n or name in MESSAGE_REASONS:
+                refused_by[name] = n
         return RunSummary(
             frames=self.frames,
             duration_s=duration_s,

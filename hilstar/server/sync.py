@@ -68,14 +68,16 @@ class Exposures:
     @property
     def every_hz(self) -> float:
         """How often the tracker exposes."""
-        return 1 / self.exposure_s if self.frame_hz is None else self.frame_hz
+        if self.frame_hz is None:
+            return 1 / self.exposure_s
+        return self.frame_hz
 
     @property
     def lit(self) -> float:
         """The part of a refresh for which a row stays lit."""
-        return (
-            1.0 if self.lit_s is None else min(max(self.lit_s * self.refresh_hz, SHORTEST_LIT), 1.0)
-        )
+        if self.lit_s is None:
+            return 1.0
+        return min(max(self.lit_s * self.refresh_hz, SHORTEST_LIT), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,8 @@ def seen_at(exposures: Exposures, phase: FloatArray) -> SeenBeat:
     is off by that rate times `off_s`.
     """
     begin = np.asarray(phase, dtype=np.float64) % 1.0
-    length, lit = exposures.refreshes, exposures.lit
+    length = exposures.refreshes
+    lit = exposures.lit
     (light, moment), (light_0, moment_0) = _integrals(begin + length, lit), _integrals(begin, lit)
     light = light - light_0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -150,10 +153,14 @@ def beat(exposures: Exposures) -> Beat:
     phases = np.concatenate(
         [np.arange(PHASES) / PHASES, *(edges + side for side in (-EDGE, 0.0, EDGE))]
     )
-    seen = seen_at(exposures, phases)
-    arcsec = float(np.nanmax(np.abs(seen.off_s))) * ARCSEC_PER_DEG
-    dim, bright = float(seen.light.min()), float(seen.light.max())
-    mag = math.inf if dim <= 0 else 2.5 * max(math.log10(bright), -math.log10(dim))
+    sweep = seen_at(exposures, phases)
+    arcsec = float(np.nanmax(np.abs(sweep.off_s))) * ARCSEC_PER_DEG
+    dim = float(sweep.light.min())
+    bright = float(sweep.light.max())
+    if dim <= 0:
+        mag = math.inf
+    else:
+        mag = 2.5 * max(math.log10(bright), -math.log10(dim))
     if abs(length - round(length)) < NO_BEAT and exposures.lit == 1.0:
         return Beat(length, None, 0.0)
     # The refresh as the tracker's frames sample it: the difference from the nearest multiple of
@@ -219,9 +226,16 @@ def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposu
     """The exposures of a bench, with its screen's nominal refresh rate or a measured one. Raises
     InputError.
     """
-    monitor, tracker = config.monitor, config.tracker
-    lit_s = None if monitor.hold_ms is None else monitor.hold_ms * NS_PER_MS / NS_PER_S
-    hz = monitor.refresh_hz if refresh_hz is None else refresh_hz
+    monitor = config.monitor
+    tracker = config.tracker
+    if monitor.hold_ms is None:
+        lit_s = None
+    else:
+        lit_s = monitor.hold_ms * NS_PER_MS / NS_PER_S
+    if refresh_hz is None:
+        hz = monitor.refresh_hz
+    else:
+        hz = refresh_hz
     return Exposures(hz, tracker.exposure_s, tracker.frame_hz, lit_s, tracker.trigger == "external")
 
 
@@ -233,7 +247,8 @@ def beat_of(
     `refresh_hz` is that of the display where it was measured, `modes_hz` are those that the display
     has.
     """
-    exposures, render = exposures_of(config, refresh_hz), config.render
+    exposures = exposures_of(config, refresh_hz)
+    render = config.render
     pixel_arcsec = (
         config.monitor.pixel_pitch_um
         * MM_PER_UM
@@ -243,16 +258,16 @@ def beat_of(
     tolerance = Tolerance(
         config.sync.turn_deg_s, render.tolerance_px * pixel_arcsec, render.tolerance_mag
     )
-    found = beat(exposures)
-    matters = tolerance.is_broken_by(found)
-    arcsec = found.worst_arcsec_per_deg_s
+    frame_beat = beat(exposures)
+    matters = tolerance.is_broken_by(frame_beat)
+    arcsec = frame_beat.worst_arcsec_per_deg_s
     return BeatSummary(
         refresh_hz=exposures.refresh_hz,
         exposure_s=exposures.exposure_s,
-        refreshes_per_exposure=found.refreshes_per_exposure,
-        period_s=found.period_s,
+        refreshes_per_exposure=frame_beat.refreshes_per_exposure,
+        period_s=frame_beat.period_s,
         worst_arcsec=None if arcsec is None else arcsec * tolerance.turn_deg_s,
-        worst_mag=found.worst_mag if math.isfinite(found.worst_mag) else None,
+        worst_mag=frame_beat.worst_mag if math.isfinite(frame_beat.worst_mag) else None,
         turn_deg_s=tolerance.turn_deg_s,
         tolerance_arcsec=tolerance.arcsec,
         tolerance_mag=tolerance.mag,
@@ -283,7 +298,10 @@ def propose(
     # So many refreshes, or as many fewer as the tracker's frames have room for.
     if exposures.frame_hz is not None:
         whole = min(whole, math.floor(exposures.refresh_hz / exposures.frame_hz + NO_BEAT))
-    exposure_s = whole / exposures.refresh_hz if whole else None
+    if whole:
+        exposure_s = whole / exposures.refresh_hz
+    else:
+        exposure_s = None
     cured = exposure_s is not None and not tolerance.is_broken_by(
         beat(replace(exposures, exposure_s=exposure_s))
     )

@@ -29,7 +29,8 @@ class AttitudeWatch:
     """Watches the attitude of each frame, before an operator's keys change it."""
 
     def __init__(self, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self._notices, self._clock = notices, clock
+        self._notices = notices
+        self._clock = clock
         self._begun_ns: int | None = None
         self._seen = self._missed = False
         self._stale_ns: int | None = None  # since when, host time
@@ -59,7 +60,8 @@ class AttitudeWatch:
                 f"the attitude is stale: the newest is {attitude.age_ns / NS_PER_S:.3g} s old",
             )
         elif not stale and self._stale_ns is not None:
-            stale_s, self._stale_ns = (now_ns - self._stale_ns) / NS_PER_S, None
+            stale_s = (now_ns - self._stale_ns) / NS_PER_S
+            self._stale_ns = None
             self._notices.tell("fresh", f"the attitude is fresh again, after {stale_s:.1f} s")
 
 
@@ -70,7 +72,9 @@ class FrameWatch:
 
     def __init__(self, period_ns: float, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._late_ns = max(LATE_PERIODS * period_ns, LATE_NS)
-        self._clock, self._notices, self._number = clock, notices, 0
+        self._clock = clock
+        self._notices = notices
+        self._number = 0
         # name and begin; one list, so that the other thread reads a whole one
         self._stages: list[tuple[str, int]] = []
         self._told_ns = 0
@@ -91,7 +95,8 @@ class FrameWatch:
 
     def end(self, timed: bool) -> None:
         """The frame is done, or given up; one that is not `timed` is never late."""
-        now_ns, stages = self._clock.now_ns(), self._stages
+        now_ns = self._clock.now_ns()
+        stages = self._stages
         self._stages = []
         self.alive_ns = now_ns
         if not timed or not stages or now_ns - stages[0][1] <= self._late_ns:
@@ -100,10 +105,12 @@ class FrameWatch:
             self._told_ns = now_ns
             took_ms = (now_ns - stages[0][1]) / NS_PER_MS
             ends = zip(stages, [*(begin for _, begin in stages[1:]), now_ns], strict=True)
-            told = ", ".join(
+            stage_times = ", ".join(
                 f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in ends
             )
-            self._notices.tell("frame-late", f"frame {self._number} took {took_ms:.0f} ms: {told}")
+            self._notices.tell(
+                "frame-late", f"frame {self._number} took {took_ms:.0f} ms: {stage_times}"
+            )
 
     def idle(self) -> None:
         """No frame is due, and the loop waits for one."""
@@ -112,7 +119,8 @@ class FrameWatch:
     def _run(self) -> None:
         stuck: tuple[str, int] | None = None
         while not self._stop.wait(LOOK_S):
-            stages, number = self._stages, self._number
+            stages = self._stages
+            number = self._number
             if not stages or stages[-1] == stuck:
                 continue
             now_ns = self._clock.now_ns()
@@ -148,7 +156,10 @@ class GpuWatch:
         stop: threading.Event,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
-        self._backend, self._notices, self._stop, self._clock = backend, notices, stop, clock
+        self._backend = backend
+        self._notices = notices
+        self._stop = stop
+        self._clock = clock
         backend.remember_tables()
         if fault := backend.fault():  # a fault from before the run
             notices.tell("gpu-error", f"before the first frame {fault}")
@@ -164,7 +175,8 @@ class GpuWatch:
             return
         self._next_ns = now_ns + GPU_LOOK_NS
         fault = self._backend.fault()
-        before_ns, self._asleep_ns = self._asleep_ns, self._clock.asleep_ns()
+        before_ns = self._asleep_ns
+        self._asleep_ns = self._clock.asleep_ns()
         if not fault and (slept_ns := self._asleep_ns - before_ns) > SLEPT_NS:
             self._notices.tell(
                 "resumed",
@@ -172,11 +184,12 @@ class GpuWatch:
             )
             changed = self._backend.changed_tables()
             self._backend.forget_images()
-            fault = (
-                f"the GPU's memory was lost in sleep, {changed} of the tables that make codes"
-                if changed
-                else ""
-            )
+            if changed:
+                fault = (
+                    f"the GPU's memory was lost in sleep, {changed} of the tables that make codes"
+                )
+            else:
+                fault = ""
         if fault:
             self.lost(fault)
 

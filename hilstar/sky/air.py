@@ -44,7 +44,8 @@ def scintillation(
     """
     if not exposure_s:
         return np.full_like(masses, MAX_TWINKLE)
-    across, down = (aperture_mm / 10) ** (-2 / 3), np.exp(-height_m / 8000)
+    across = (aperture_mm / 10) ** (-2 / 3)
+    down = np.exp(-height_m / 8000)
     return np.asarray(
         np.minimum(0.09 * across * masses**1.75 * down / np.sqrt(2 * exposure_s), MAX_TWINKLE)
     )
@@ -150,13 +151,13 @@ class SiteAir:
         share = self.shares(stars.row, air.altitude_rad(stars.vectors))
         if stars.colours is None or len(share) == 1:
             return replace(stars, air=air, electrons_per_s=stars.electrons_per_s * share[0])
-        each = stars.colours * share.T
-        total = np.maximum(each.sum(axis=1), 1e-300)
+        channel_shares = stars.colours * share.T
+        total = np.maximum(channel_shares.sum(axis=1), 1e-300)
         return replace(
             stars,
             air=air,
             electrons_per_s=stars.electrons_per_s * total,
-            colours=each / total[:, None],
+            colours=channel_shares / total[:, None],
         )
 
     def shares(self, row: IntArray, altitude_rad: FloatArray) -> FloatArray:

@@ -136,8 +136,10 @@ class Catalog:
     def brighter_than(self, faintest_v_mag: float) -> "Catalog":
         """The stars with v_mag <= `faintest_v_mag` (inclusive)."""
         # places: a mask is searched again for each column
-        kept = np.flatnonzero(self.v_mag <= faintest_v_mag)
-        return self if len(kept) == len(self) else self.taken(kept)
+        bright = np.flatnonzero(self.v_mag <= faintest_v_mag)
+        if len(bright) == len(self):
+            return self
+        return self.taken(bright)
 
     def name(self, row: int) -> str:
         """The designation of the star at `row`: "HIP 26311", "Gaia DR3 4295806720", "TYC 1-2-3"."""
@@ -159,11 +161,9 @@ class Catalog:
         if not all(n.isascii() and n.isdigit() and len(n) <= MAX_DIGITS for n in numbers):
             return None
         if self.designation == TYCHO:
-            return (
-                int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2])
-                if len(numbers) == 3
-                else None
-            )
+            if len(numbers) == 3:
+                return int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2])
+            return None
         return int(numbers[0]) if len(numbers) == 1 else None
 
 
@@ -186,7 +186,9 @@ def plain_catalog(
     the epoch is Hipparcos'.
     """
     n = len(columns["v_mag"])
-    unknown, zero, blank = np.full(n, np.nan), np.zeros(n), np.zeros(n, dtype="S1")
+    unknown = np.full(n, np.nan)
+    zero = np.zeros(n)
+    blank = np.zeros(n, dtype="S1")
     none: dict[str, npt.NDArray[np.generic]] = {
         **dict.fromkeys(("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "bv_mag"), zero),
         **dict.fromkeys(("vi_mag", "parallax_mas", "maximum_jd"), unknown),
@@ -218,9 +220,9 @@ def _packaged(faintest_v_mag: float) -> Catalog:
     open several benches.
     """
     with np.load(PACKAGED_CATALOG) as packed:
-        kept = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
+        bright = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
         catalog = unpack(
-            {name: packed[name][kept] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"])
+            {name: packed[name][bright] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"])
         )
     for name in column_names():
         getattr(catalog, name).setflags(write=False)

@@ -70,7 +70,10 @@ class TangentImage:
         if sigma < MIN_SIGMA:
             return whole
         is_of_cube = math.isfinite(self.max_tangent)
-        padded = whole.image if is_of_cube else np.pad(whole.image, math.ceil(4 * sigma))
+        if is_of_cube:
+            padded = whole.image
+        else:
+            padded = np.pad(whole.image, math.ceil(4 * sigma))
         return replace(
             whole,
             image=gaussian_filter(padded, sigma, mode="nearest" if is_of_cube else "constant"),
@@ -132,14 +135,17 @@ def brightness(path: Path, values: Any, unit_name: str | None) -> FloatArray:
         unit = u.Unit(unit_name or "")
         if "mag" in str(unit):
             square = (u.mag / unit).to(u.sr)
-            found = 10 ** (-0.4 * np.asarray(values, dtype=np.float64)) / square
+            w_m2_m_sr = 10 ** (-0.4 * np.asarray(values, dtype=np.float64)) / square
         else:
             scale = (1 * unit).to(u.W / u.m**3 / u.sr, u.spectral_density(V_NM * u.nm)).value
-            found = np.asarray(values, dtype=np.float64) * (scale / VEGA_V0_W_M2_M)
+            w_m2_m_sr = np.asarray(values, dtype=np.float64) * (scale / VEGA_V0_W_M2_M)
     except (ValueError, TypeError) as error:
-        said = "no unit" if not unit_name else f"unit {unit_name!r}, which is no surface brightness"
-        raise InputError(f"{path}: {said}; {UNIT_ADVICE}") from error
-    return np.asarray(np.maximum(np.nan_to_num(found, nan=0.0, posinf=0.0), 0.0))
+        if not unit_name:
+            unit_text = "no unit"
+        else:
+            unit_text = f"unit {unit_name!r}, which is no surface brightness"
+        raise InputError(f"{path}: {unit_text}; {UNIT_ADVICE}") from error
+    return np.asarray(np.maximum(np.nan_to_num(w_m2_m_sr, nan=0.0, posinf=0.0), 0.0))
 
 
 def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
@@ -156,7 +162,9 @@ def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     frame = wcs_to_celestial_frame(wcs)
     px_rad = math.radians(float(np.min(proj_plane_pixel_scales(wcs))))
     count = max(math.ceil(max(light.shape) / MAX_SIDE_PX), 1)
-    light, wcs, px_rad = block_means(light, count), wcs[::count, ::count], px_rad * count
+    light = block_means(light, count)
+    wcs = wcs[::count, ::count]
+    px_rad = px_rad * count
     rows, columns = light.shape
 
     to_frame = _turned(frame)
@@ -173,13 +181,13 @@ def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     x, y = np.meshgrid(np.linspace(-0.5, columns - 0.5, 33), np.linspace(-0.5, rows - 0.5, 33))
     world = np.radians(wcs.pixel_to_world_values(x.ravel(), y.ravel()))
     lon, lat = world[:, np.isfinite(world).all(axis=0)]
-    seen = to_frame.T @ np.stack(
+    frame_directions = to_frame.T @ np.stack(
         [np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)]
     )
-    middle = seen.mean(axis=1)
+    middle = frame_directions.mean(axis=1)
     middle /= np.linalg.norm(middle) or 1.0
-    reach = math.acos(np.clip(float((middle @ seen).min()), -1.0, 1.0))
-    if reach > math.radians(MAX_HALF_DEG) or world.shape[1] != seen.shape[1]:
+    reach = math.acos(np.clip(float((middle @ frame_directions).min()), -1.0, 1.0))
+    if reach > math.radians(MAX_HALF_DEG) or world.shape[1] != frame_directions.shape[1]:
         return _cube(sampled, math.ceil(2 / px_rad))
     axes = _axes_about(middle)
     half = math.tan(reach + px_rad)
@@ -208,9 +216,10 @@ def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     if header.get("INDXSCHM", "IMPLICIT").strip() != "IMPLICIT" or len(light) != grid.npix:
         raise InputError(f"{path}: {len(light)} pixels of {grid.npix}; give a map of the whole sky")
     if grid.nside > MAX_NSIDE:
-        nested = (
-            light if grid.order == "nested" else light[grid.nested_to_ring(np.arange(grid.npix))]
-        )
+        if grid.order == "nested":
+            nested = light
+        else:
+            nested = light[grid.nested_to_ring(np.arange(grid.npix))]
         grid = HEALPix(MAX_NSIDE, "nested")
         light = nested.reshape(grid.npix, -1).mean(axis=1)
 
@@ -219,7 +228,8 @@ def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     def sampled(directions: FloatArray) -> FloatArray:
         x, y, z = (directions @ to_frame.T).T
         # Its interpolation divides by zero at longitudes below 0.
-        lon, lat = np.arctan2(y, x) % (2 * np.pi) * u.rad, np.arcsin(np.clip(z, -1.0, 1.0)) * u.rad
+        lon = np.arctan2(y, x) % (2 * np.pi) * u.rad
+        lat = np.arcsin(np.clip(z, -1.0, 1.0)) * u.rad
         return np.asarray(grid.interpolate_bilinear_lonlat(lon, lat, light))
 
     return _cube(sampled, math.ceil(2 / grid.pixel_resolution.to_value("rad")))

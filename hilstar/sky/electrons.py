@@ -98,11 +98,10 @@ class Optics:
     @property
     def range_nm(self) -> tuple[float, float]:
         """The wavelengths that the tracker detects: where both curves have values."""
-        ranged = [
-            c.wavelength_nm
-            for c in (self.quantum_efficiency, self.transmission)
-            if len(c.wavelength_nm)
-        ]
+        ranged = []
+        for c in (self.quantum_efficiency, self.transmission):
+            if len(c.wavelength_nm):
+                ranged.append(c.wavelength_nm)
         return max(w[0] for w in ranged), min(w[-1] for w in ranged)
 
 
@@ -113,8 +112,8 @@ def all_channels(channels: Sequence[Optics]) -> Optics:
     """
     if len(channels) == 1:
         return channels[0]
-    curves = [one.quantum_efficiency for one in channels]
-    ranges = [one.range_nm for one in channels]
+    curves = [channel.quantum_efficiency for channel in channels]
+    ranges = [channel.range_nm for channel in channels]
     curves = [
         curve if len(curve.wavelength_nm) else Curve(np.array(range_nm), np.full(2, curve.value[0]))
         for curve, range_nm in zip(curves, ranges, strict=True)
@@ -330,7 +329,8 @@ class PicklesTable:
         log_rate = np.empty(len(v_mag))
         for begin in range(0, len(v_mag), BLOCK_STARS):
             part = slice(begin, begin + BLOCK_STARS)
-            vi, bv = vi_mag[part], bv_mag[part]
+            vi = vi_mag[part]
+            bv = bv_mag[part]
             known = np.isfinite(vi)
             block = log_rate[part]
             block[known] = self.over_vi(vi[known]) + self.per_bv * np.clip(
@@ -455,15 +455,16 @@ def _onto_grid(grid_nm: FloatArray, nodes_nm: FloatArray, response: FloatArray) 
     """Weights on the samples that integrate the straight lines between them as `response` does
     at the nodes.
     """
-    left = np.clip(np.searchsorted(grid_nm, nodes_nm, side="right") - 1, 0, len(grid_nm) - 2)
-    share = (nodes_nm - grid_nm[left]) / (grid_nm[left + 1] - grid_nm[left])
-    weights = np.bincount(left, response * (1 - share), len(grid_nm))
-    return np.asarray(weights + np.bincount(left + 1, response * share, len(grid_nm)))
+    lower_node = np.clip(np.searchsorted(grid_nm, nodes_nm, side="right") - 1, 0, len(grid_nm) - 2)
+    share = (nodes_nm - grid_nm[lower_node]) / (grid_nm[lower_node + 1] - grid_nm[lower_node])
+    weights = np.bincount(lower_node, response * (1 - share), len(grid_nm))
+    return np.asarray(weights + np.bincount(lower_node + 1, response * share, len(grid_nm)))
 
 
 def _check_range(library: Library, optics: Optics) -> None:
     nodes_nm, _ = integration_nodes(optics.quantum_efficiency, optics.transmission)
-    low_nm, high_nm = library.wavelength_nm[0], library.wavelength_nm[-1]
+    low_nm = library.wavelength_nm[0]
+    high_nm = library.wavelength_nm[-1]
     seen_nm = nodes_nm[optics.quantum_efficiency(nodes_nm) * optics.transmission(nodes_nm) > 0]
     if len(seen_nm) and (seen_nm[0] < low_nm or seen_nm[-1] > high_nm):
         raise InputError(

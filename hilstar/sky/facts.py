@@ -71,9 +71,9 @@ def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
     order = np.argsort(facts["hip"])
     place = np.minimum(np.searchsorted(facts["hip"], hip, sorter=order), len(order) - 1)
     row = order[place]
-    found = facts["hip"][row] == hip
+    has_row = facts["hip"][row] == hip
     return {
-        name: np.where(found, values[row], np.nan if values.dtype.kind == "f" else b"")
+        name: np.where(has_row, values[row], np.nan if values.dtype.kind == "f" else b"")
         for name, values in facts.items()
         if name != "hip"
     }
@@ -84,9 +84,11 @@ def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
     alone, NaN for a table's stars.
     """
     facts = facts_of(catalog.hip)
-    own = (catalog.identifier == catalog.hip) & (catalog.epoch_jyear == HIPPARCOS_EPOCH_JYEAR)
+    is_hipparcos = (catalog.identifier == catalog.hip) & (
+        catalog.epoch_jyear == HIPPARCOS_EPOCH_JYEAR
+    )
     errors = [name for name in STEP_FACTS if name.startswith("sigma_")]
-    return facts | {name: np.where(own, facts[name], np.nan) for name in errors}
+    return facts | {name: np.where(is_hipparcos, facts[name], np.nan) for name in errors}
 
 
 class PropagatedPlaces(NamedTuple):
@@ -133,7 +135,8 @@ def motion_at(
         jacobian[:, 1, k] = flat * du[2] - z * (x * du[0] + y * du[1]) / flat
         jacobian[:, 2, k], jacobian[:, 3, k] = d_ra, d_dec
     covariance = jacobian @ _covariance(facts) @ jacobian.transpose(0, 2, 1)
-    ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, flat))
+    ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
+    dec_deg = np.degrees(np.arctan2(z, flat))
     return PropagatedPlaces(
         ra_deg, dec_deg, pm_ra.real / RAD_PER_MAS, pm_dec.real / RAD_PER_MAS, covariance
     )
@@ -146,7 +149,10 @@ def _moved(
     (4, n), radians.
     """
     ra, dec, east, north = start
-    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
+    sin_ra = np.sin(ra)
+    cos_ra = np.cos(ra)
+    sin_dec = np.sin(dec)
+    cos_dec = np.cos(dec)
     u0 = np.stack((cos_dec * cos_ra, cos_dec * sin_ra, sin_dec))
     motion = np.stack(
         (
@@ -177,11 +183,11 @@ def _covariance(facts: dict[str, npt.NDArray[Any]]) -> FloatArray:
         ]
     )
     covariance = np.empty((sigma.shape[1], 4, 4))
-    for i, one in enumerate(MOTION):
+    for i, quantity in enumerate(MOTION):
         covariance[:, i, i] = sigma[i] ** 2
         for j in range(i + 1, 4):
             covariance[:, i, j] = covariance[:, j, i] = (
-                sigma[i] * sigma[j] * facts[f"{one}_{MOTION[j]}_correlation"]
+                sigma[i] * sigma[j] * facts[f"{quantity}_{MOTION[j]}_correlation"]
             )
     return covariance
 

@@ -59,8 +59,8 @@ def luminosity_class(spectral_type: npt.NDArray[np.bytes_]) -> npt.NDArray[np.st
     """The luminosity class in MK types (n,), such as "III" or "Ib": the first where two are
     given, "" where none is.
     """
-    found = (CLASS.search(text.decode()) for text in spectral_type.tolist())
-    return np.array(["" if match is None else match[1] for match in found], dtype=np.str_)
+    matches = (CLASS.search(text.decode()) for text in spectral_type.tolist())
+    return np.array(["" if match is None else match[1] for match in matches], dtype=np.str_)
 
 
 def read_types(spectral_type: npt.NDArray[np.bytes_]) -> FloatArray:
@@ -75,10 +75,10 @@ def read_types(spectral_type: npt.NDArray[np.bytes_]) -> FloatArray:
 
 
 def _read(text: str) -> tuple[float, float]:
-    found = TYPE.match(text)
-    if found is None:
+    type_match = TYPE.match(text)
+    if type_match is None:
         return np.nan, np.nan
-    letter, first, other, second = found.groups()
+    letter, first, other, second = type_match.groups()
     subclass = [10.0 * LETTERS.index(letter) + float(first or 5)]
     if first and second:
         subclass.append(10.0 * LETTERS.index(other or letter) + float(second))
@@ -118,7 +118,8 @@ def bare_and_dusty() -> electrons.Library:
     from scipy.interpolate import CubicSpline  # which a bench without types need not load
 
     bare = electrons.load_library()
-    wavelength_nm, curve = bare.wavelength_nm, CubicSpline(DUST_PER_UM, DUST_MAG, bc_type="natural")
+    wavelength_nm = bare.wavelength_nm
+    curve = CubicSpline(DUST_PER_UM, DUST_MAG, bc_type="natural")
     flux = bare.flux * flux_ratio(DUST_EBV_MAG * curve(1000.0 / wavelength_nm))
     behind = replace(bare, flux=flux)
     v, i = (read_curve_csv(DATA_DIR / f"{name}.csv") for name in ("johnson-v", "bessell-i"))
@@ -182,13 +183,12 @@ def _alike_types(kind: FloatArray, other: FloatArray) -> FloatArray:
     """The part of the covariance of ln(rate) that types have, between (n, 2 or more) and (k, 2
     or more), shape (n, k).
     """
-    late = [
-        1 + LATE_EXTRA * np.interp(part[:, 0], LATE_SUBCLASS, (0.0, 1.0)) for part in (kind, other)
-    ]
-    apart = [
-        (kind[:, column, None] - other[:, column]) / length
-        for column, length in enumerate(TYPE_LENGTHS)
-    ]
+    late = []
+    for part in (kind, other):
+        late.append(1 + LATE_EXTRA * np.interp(part[:, 0], LATE_SUBCLASS, (0.0, 1.0)))
+    apart = []
+    for column, length in enumerate(TYPE_LENGTHS):
+        apart.append((kind[:, column, None] - other[:, column]) / length)
     return np.asarray(late[0][:, None] * late[1] * np.exp(-(apart[0] ** 2 + apart[1] ** 2) / 2))
 
 
@@ -223,8 +223,9 @@ def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) 
     system = np.block(
         [[covariance, trend], [trend.T, np.zeros((TREND_DEGREE + 1, TREND_DEGREE + 1))]]
     )
-    found = np.linalg.solve(system, np.concatenate([np.log(rate), np.zeros(TREND_DEGREE + 1)]))
-    weight, coefficients = found[: len(rate)], found[len(rate) :]
+    solution = np.linalg.solve(system, np.concatenate([np.log(rate), np.zeros(TREND_DEGREE + 1)]))
+    weight = solution[: len(rate)]
+    coefficients = solution[len(rate) :]
     by_colour = electrons.fit_table(library.bv_mag[bare], library.vi_mag[bare], rate[bare])
     return TypeTable(by_colour, coefficients, np.column_stack([kind, library.vi_mag]), weight)
 
@@ -247,4 +248,4 @@ def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
         detected.sum(axis=1), np.finfo(np.float64).tiny
     )
     classes = np.array([kind[0] for kind in library.spectral_type])
-    return {one: float(shares[classes == one].mean()) for one in LETTERS}
+    return {letter: float(shares[classes == letter].mean()) for letter in LETTERS}

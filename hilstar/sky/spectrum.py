@@ -203,7 +203,8 @@ def _nm_of(table: TextTable, wavelength: Chosen, wavelengths: FloatArray) -> flo
     """By what wavelengths are multiplied to be nm. Raises InputError where their range and their
     unit disagree.
     """
-    low, high = float(wavelengths.min()), float(wavelengths.max())
+    low = float(wavelengths.min())
+    high = float(wavelengths.max())
     unit = _unit_by_range(low, high)
     span = f"wavelengths from {low:g} to {high:g}"
     if not wavelength.has_unit:
@@ -249,7 +250,8 @@ def _unit_by_range(low: float, high: float) -> str | None:
 
 
 def _check_curve(curve: Curve, path: Path, highest: float) -> None:
-    wavelength_nm, value = curve.wavelength_nm, curve.value
+    wavelength_nm = curve.wavelength_nm
+    value = curve.value
     if len(wavelength_nm) < 2:
         raise InputError(
             f"{path}: {len(wavelength_nm)} rows; write at least two rows wavelength_nm,value"
@@ -270,7 +272,10 @@ def _check_curve(curve: Curve, path: Path, highest: float) -> None:
             f"{path}: wavelengths from {ends}; write {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm"
         )
     if value.min() < 0 or value.max() > highest:
-        what = "fractions from 0 to 1" if highest == 1 else f"numbers from 0 to {highest:g}"
+        if highest == 1:
+            what = "fractions from 0 to 1"
+        else:
+            what = f"numbers from 0 to {highest:g}"
         raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; write {what}")
 
 
@@ -319,7 +324,8 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     Gauss-Legendre between every two neighbouring knots of all curves, over the range they share.
     """
     ranged = [curve.wavelength_nm for curve in curves if len(curve.wavelength_nm)]
-    low, high = max(w[0] for w in ranged), min(w[-1] for w in ranged)
+    low = max(w[0] for w in ranged)
+    high = min(w[-1] for w in ranged)
     knots = np.sort(np.concatenate(ranged))
     knots = knots[(knots >= low) & (knots <= high) & (np.diff(knots, prepend=-np.inf) > 0)]
     if len(knots) < 2:

@@ -131,7 +131,7 @@ def assemble(
     columns = _Columns(path, table)
     columns.check_turn()
     ra_deg, dec_deg = columns.places()
-    v_mag, bv_mag, vi_mag, words = columns.magnitudes()
+    v_mag, bv_mag, vi_mag, notes = columns.magnitudes()
     pm = {role: columns.role(role, 0.0) for role in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")}
     figures: dict[str, npt.NDArray[Any]] = {
         "ra_deg": ra_deg,
@@ -145,38 +145,45 @@ def assemble(
     }
     designation, identifier = columns.identifiers()
     reason = _dropped(figures)
-    kept = reason == 0
-    if not kept.any():
+    is_usable = reason == 0
+    if not is_usable.any():
         raise InputError(
             f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)});"
             f" {table_reader.COLUMNS_WANTED}"
         )
-    dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
+    dated = compared or any((motion[is_usable] != 0).any() for motion in pm.values())
     epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
     for doubt in (columns.places_doubt(), columns.motions_doubt(pm)):
         if doubt and not columns.is_gaia:
             raise InputError(f"{path}: {doubt}")
         if doubt:
             columns.notices.append(f"{doubt}; taken as Gaia's archive has it")
-    if _repeats(identifier[kept]):
-        columns.notices.append(f"{_repeats(identifier[kept])} of its stars have {NO_IDENTIFIER}")
+    if _repeats(identifier[is_usable]):
+        columns.notices.append(
+            f"{_repeats(identifier[is_usable])} of its stars have {NO_IDENTIFIER}"
+        )
         designation, identifier = columns.row_numbers()
     hip = columns.hip()
-    repeated = _repeated_hip(hip, kept)
+    repeated = _repeated_hip(hip, is_usable)
     if repeated:
         columns.notices.append(repeated)
     figures |= {
         "epoch_jyear": epoch,
         "identifier": identifier,
-        "hip": _once(hip, kept, v_mag),
+        "hip": _once(hip, is_usable, v_mag),
     }
     catalog = plain_catalog(
-        designation, len(kept), {name: values[kept] for name, values in figures.items()}
+        designation, len(is_usable), {name: values[is_usable] for name, values in figures.items()}
     )
-    rest = "" if kept.all() else f"; not used: {_reasons(reason)}"
-    line = f"{path.name}: {len(catalog)} stars of {len(kept)} rows, {words}; {epoch_words}{rest}"
+    if is_usable.all():
+        rest = ""
+    else:
+        rest = f"; not used: {_reasons(reason)}"
+    line = (
+        f"{path.name}: {len(catalog)} stars of {len(is_usable)} rows, {notes}; {epoch_words}{rest}"
+    )
     doubts = tuple(f"{path.name}: {notice}" for notice in columns.notices)
-    return Assembled(catalog, line, int((~kept).sum()), doubts)
+    return Assembled(catalog, line, int((~is_usable).sum()), doubts)
 
 
 class TableMagnitudes(NamedTuple):
@@ -192,7 +199,9 @@ class _Columns:
     """A table's columns by role, in the units of a catalogue."""
 
     def __init__(self, path: Path, table: table_reader.RawTable) -> None:
-        self.path, self.table, self.layout = path, table, table.layout
+        self.path = path
+        self.table = table
+        self.layout = table.layout
         self.pair = self.layout.places[0]
         self.notices = list(table.notices)
 
@@ -241,7 +250,9 @@ class _Columns:
         placed = np.isfinite(ra) & np.isfinite(dec)
         if self.has_unit(name) or not placed.any():
             return ""
-        low, high, steepest = ra[placed].min(), ra[placed].max(), np.abs(dec[placed]).max()
+        low = ra[placed].min()
+        high = ra[placed].max()
+        steepest = np.abs(dec[placed]).max()
         base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
         if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
@@ -293,7 +304,7 @@ class _Columns:
     def magnitudes(self) -> TableMagnitudes:
         """The magnitudes of each row by the first conversion that its columns allow."""
         v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
-        words: list[str] = []
+        notes: list[str] = []
         for route in (
             route for route in table_reader.ROUTES if route.roles in self.layout.magnitudes
         ):
@@ -303,13 +314,13 @@ class _Columns:
             new_v, new_bv, new_vi = route.convert(
                 *(self.role(role, np.nan)[blank] for role in route.roles)
             )
-            if np.isfinite(new_v).any() and route.words not in words:
-                words.append(route.words)
+            if np.isfinite(new_v).any() and route.words not in notes:
+                notes.append(route.words)
             v[blank], bv[blank], vi[blank] = new_v, new_bv, new_vi
         if "vi_mag" in self.layout.role:
             given = self.role("vi_mag", np.nan)
             vi = np.where(np.isfinite(given), given, vi)
-        return TableMagnitudes(v, bv, vi, ", ".join(words))
+        return TableMagnitudes(v, bv, vi, ", ".join(notes))
 
     def variables(self) -> dict[str, npt.NDArray[Any]]:
         """Type, range, period and a time of largest light, where a row has all of its three
@@ -333,7 +344,8 @@ class _Columns:
         """What the stars are called, and the number of each: Gaia's, Tycho's, or that of the
         row, from 1.
         """
-        role, columns = self.layout.role, self.table.columns
+        role = self.layout.role
+        columns = self.table.columns
         if "gaia" in role:
             epoch = self.role("epoch_jyear", GAIA_DR3_JYEAR)
             return "Gaia DR2" if (epoch == GAIA_DR2_JYEAR).all() else "Gaia DR3", np.asarray(
@@ -429,7 +441,10 @@ def _repeated_hip(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_]) -> st
     place = int(np.argmax(counts))
     example = f"HIP {numbers[place]} of {counts[place]}"
     number = int(several.sum())
-    what = "1 HIP number is" if number == 1 else f"{number} HIP numbers are"
+    if number == 1:
+        what = "1 HIP number is"
+    else:
+        what = f"{number} HIP numbers are"
     return f"{what} of several stars each ({example}); the brightest keeps it, the others have none"
 
 
@@ -475,10 +490,9 @@ def join(hipparcos: Catalog, table: Catalog) -> Joined:
     held = _held(hipparcos, table, owner, arcsec)
     difference = _differences(hipparcos, table, owner, held)
     added = table.taken(~held)
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(hipparcos, name), getattr(added, name)])
-        for name in column_names()
-    }
+    joined: dict[str, Any] = {}
+    for name in column_names():
+        joined[name] = np.concatenate([getattr(hipparcos, name), getattr(added, name)])
     catalog = replace(
         hipparcos,
         **joined,
@@ -547,14 +561,15 @@ def _differences(
         return _Differences(0, 0.0, f"{of_both} stars of Hipparcos are among them")
     v_mag = table.v_mag[star] - hipparcos.v_mag[owner[star]]
     bv_mag = table.bv_mag[star] - hipparcos.bv_mag[owner[star]]
-    median_mag, wide_mag = float(np.median(v_mag)), float(np.quantile(np.abs(v_mag), 0.95))
+    median_mag = float(np.median(v_mag))
+    wide_mag = float(np.quantile(np.abs(v_mag), 0.95))
     odd = int((np.abs(v_mag) > ODD_MAG).sum())
-    words = (
+    difference_note = (
         f"{of_both} stars of Hipparcos are among them, of {len(star)} single constant ones V"
         f" differs by {median_mag:+.3f} mag in the median ({wide_mag:.3f} at 95 %, {odd} by more"
         f" than {ODD_MAG:g}) and B-V by {float(np.median(bv_mag)):+.3f}"
     )
-    return _Differences(len(star), median_mag, words)
+    return _Differences(len(star), median_mag, difference_note)
 
 
 def _doubt(table: Catalog, held: npt.NDArray[np.bool_], difference: _Differences) -> str | None:
@@ -606,7 +621,10 @@ def store_path(made_of: Sequence[str]) -> Path | None:
     """
     named = os.environ.get("XDG_CACHE_HOME", "")
     try:
-        root = Path(named) if named.startswith("/") else Path.home() / ".cache"
+        if named.startswith("/"):
+            root = Path(named)
+        else:
+            root = Path.home() / ".cache"
     except RuntimeError:  # no home
         return None
     key = hashlib.sha256(json.dumps([VERSION, *made_of]).encode()).hexdigest()
@@ -636,10 +654,10 @@ def kept(path: Path) -> Kept | None:
             rows_read=int(about["rows_read"]),
             notes=notes,
         )
-        found = Kept(catalog, tuple(map(str, about["doubts"])))
+        stored = Kept(catalog, tuple(map(str, about["doubts"])))
     except Exception:  # whatever a damaged file raises in the layers of zipfile, NumPy and json
         return None
-    return found if _is_sound(catalog) else None
+    return stored if _is_sound(catalog) else None
 
 
 def _is_sound(catalog: Catalog) -> bool:
@@ -654,11 +672,10 @@ def _is_sound(catalog: Catalog) -> bool:
             return False
         if name in RANGES:
             low, high = RANGES[name]
-            bounds = (
-                (values.min(initial=high), values.max(initial=low))
-                if name in ALWAYS_KNOWN
-                else (low, high)
-            )
+            if name in ALWAYS_KNOWN:
+                bounds = (values.min(initial=high), values.max(initial=low))
+            else:
+                bounds = (low, high)
             if not (low <= bounds[0] and bounds[1] <= high):  # NaN too
                 return False
     return bool(np.isfinite(catalog.epoch_jyear).all())
@@ -735,14 +752,16 @@ def choose_catalog(choice: TableChoice) -> Catalog:
 
 
 def _made(path: Path, choice: TableChoice) -> Kept:
-    found = assemble(path, table_reader.read_table(path), choice.epoch_jyear, choice.with_hipparcos)
-    doubts = [*found.doubts, *([found.line] if found.dropped else [])]
+    assembled = assemble(
+        path, table_reader.read_table(path), choice.epoch_jyear, choice.with_hipparcos
+    )
+    doubts = [*assembled.doubts, *([assembled.line] if assembled.dropped else [])]
     if not choice.with_hipparcos:
-        return Kept(_by_cell(found.catalog, found.line), tuple(doubts))
-    joined = join(load_catalog(), found.catalog)
+        return Kept(_by_cell(assembled.catalog, assembled.line), tuple(doubts))
+    joined = join(load_catalog(), assembled.catalog)
     if joined.doubt is not None:
         doubts.append(f"{path.name}: {joined.doubt}")
-    return Kept(_by_cell(joined.catalog, found.line, joined.line), tuple(doubts))
+    return Kept(_by_cell(joined.catalog, assembled.line, joined.line), tuple(doubts))
 
 
 def _by_cell(catalog: Catalog, *notes: str) -> Catalog:
@@ -771,25 +790,30 @@ def table_facts(
     if not any(role in columns.layout.role for role in table_reader.ERROR_NAMES):
         return facts
     by_row = columns.row_numbers()
-    identifier = by_row[1] if stars.designation == by_row[0] else columns.identifiers()[1]
+    if stars.designation == by_row[0]:
+        identifier = by_row[1]
+    else:
+        identifier = columns.identifiers()[1]
     order = np.argsort(identifier, kind="stable")
     row = order[
         np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)
     ]
-    own = (identifier[row] == stars.identifier) & ~(
+    is_own_row = (identifier[row] == stars.identifier) & ~(
         choice.with_hipparcos & (stars.hip == stars.identifier)
     )
-    found = dict(facts)
+    row_facts = dict(facts)
     for role in table_reader.ERROR_NAMES:
         name = columns.layout.role.get(role)
         if name is not None and role == table_reader.SPECTRAL_TYPE:
-            found[role] = np.where(own, columns.table.columns[name][row], facts[role])
-            found["spectral_type_source"] = np.where(own, b"U", facts["spectral_type_source"])
+            row_facts[role] = np.where(is_own_row, columns.table.columns[name][row], facts[role])
+            row_facts["spectral_type_source"] = np.where(
+                is_own_row, b"U", facts["spectral_type_source"]
+            )
         elif name is not None:
-            found[role] = np.where(own, columns.role(role, np.nan)[row], facts[role])
+            row_facts[role] = np.where(is_own_row, columns.role(role, np.nan)[row], facts[role])
     if "sigma_measured_mag" in columns.layout.role:
-        found["v_source"] = np.where(own, b"U", facts["v_source"])
-    return found
+        row_facts["v_source"] = np.where(is_own_row, b"U", facts["v_source"])
+    return row_facts
 
 
 def _is_hip_main(path: Path) -> bool:

@@ -71,7 +71,8 @@ class AirAbove:
         z = vectors @ self.up
         level = vectors - z[:, None] * self.up
         across = np.sqrt(np.einsum("ij,ij->i", level, level))
-        r, up = np.maximum(across, MIN_ACROSS), np.maximum(z, MIN_UP)
+        r = np.maximum(across, MIN_ACROSS)
+        up = np.maximum(z, MIN_UP)
         tangent = r / up
         w = b * tangent**2
         by = (a + w) * tangent / (1 + (a + 3 * w) / up**2)
@@ -86,7 +87,9 @@ class AirAbove:
 
     def most_rad(self, axis: FloatArray, radius_rad: float) -> float:
         """By how much light within an angle of a direction (3,) is bent at most."""
-        return MOST_BENT_RAD if self.lowest_rad(axis, radius_rad) < LOW_RAD else LESS_BENT_RAD
+        if self.lowest_rad(axis, radius_rad) < LOW_RAD:
+            return MOST_BENT_RAD
+        return LESS_BENT_RAD
 
     def risen(self, which: IntArray, vectors: FloatArray, lowest_rad: float) -> IntArray:
         """Those of directions (n, 3) above the horizon, which a field that reaches down to
@@ -178,29 +181,38 @@ class Stars:
             reach_rad += MAX_SHIFT * float(np.linalg.norm(self.velocity_km_s)) / LIGHT_KM_S
         if self.air is None:
             return self.grid.near(axis, radius_rad, edges, reach_rad)
-        found = self.grid.near(
+        near_stars = self.grid.near(
             axis, radius_rad, edges, reach_rad + self.air.most_rad(axis, radius_rad + reach_rad)
         )
         return self.air.risen(
-            found, self.vectors, self.air.lowest_rad(axis, radius_rad + reach_rad)
+            near_stars, self.vectors, self.air.lowest_rad(axis, radius_rad + reach_rad)
         )
 
     def directions(self, which: IntArray) -> FloatArray:
         """Where stars are seen: ICRS unit vectors (n, 3)."""
         vectors = self.vectors
-        vectors = vectors.T.take(which, axis=1).T if vectors.flags.f_contiguous else vectors[which]
-        seen = vectors if self.velocity_km_s is None else aberrate(vectors, self.velocity_km_s)
-        return seen if self.air is None else self.air.bent(seen)
+        if vectors.flags.f_contiguous:
+            vectors = vectors.T.take(which, axis=1).T
+        else:
+            vectors = vectors[which]
+        if self.velocity_km_s is None:
+            apparent = vectors
+        else:
+            apparent = aberrate(vectors, self.velocity_km_s)
+        return apparent if self.air is None else self.air.bent(apparent)
 
     def seen_at(self, velocity_km_s: FloatArray | None) -> "Stars":
         """The same stars for such an observer; None: for the one who sees `vectors`."""
-        return self if velocity_km_s is None else replace(self, velocity_km_s=velocity_km_s)
+        if velocity_km_s is None:
+            return self
+        return replace(self, velocity_km_s=velocity_km_s)
 
     def names(self, which: IntArray) -> list[str]:
         """The names of bodies and of stars without a HIP number among stars (n,), empty text for
         the others.
         """
-        first, named = len(self) - len(self.bodies), (self.hip[which] == 0).tolist()
+        first = len(self) - len(self.bodies)
+        named = (self.hip[which] == 0).tolist()
         return [
             self._name(i, first) if has_name else ""
             for i, has_name in zip(which.tolist(), named, strict=True)
@@ -209,7 +221,9 @@ class Stars:
     def _name(self, star: int, first_body: int) -> str:
         if star >= first_body:
             return self.bodies[star - first_body]
-        return "" if self.row[star] < 0 else self.catalog.name(int(self.row[star]))
+        if self.row[star] < 0:
+            return ""
+        return self.catalog.name(int(self.row[star]))
 
     def designations(self, which: IntArray) -> list[int | str]:
         """The HIP numbers of stars (n,), and the names of those that have none."""
@@ -227,8 +241,8 @@ def split_by_rate(
 
     The first are `stars` itself where no star is fainter.
     """
-    kept = stars.electrons_per_s * drive >= faintest_e_per_s
-    return stars if kept.all() else _selected(stars, kept), _selected(stars, ~kept)
+    is_bright = stars.electrons_per_s * drive >= faintest_e_per_s
+    return stars if is_bright.all() else _selected(stars, is_bright), _selected(stars, ~is_bright)
 
 
 def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
@@ -294,7 +308,8 @@ def with_bodies(
     Bodies not to be `found` are in no cell: `near` passes over them, whoever moves them adds them
     to an image. Their `colours` (k, channels) or (channels,) are wanted where stars have theirs.
     """
-    count, order = len(bodies), len(stars) + np.arange(len(bodies))
+    count = len(bodies)
+    order = len(stars) + np.arange(len(bodies))
     cells = order[: count if found else 0]
     nowhere = np.full(count, np.nan)
     grid = stars.grid
@@ -364,11 +379,14 @@ class CellGrid:
         farthest_rad = min(radius_rad + reach_rad + widest_rad, math.pi)
         hit = (self.centre @ axis >= math.cos(farthest_rad)).nonzero()[0]
         centre = self.centre.take(hit, axis=0).T
-        cos_radius, sin_radius = self.cos_radius.take(hit), self.sin_radius.take(hit)
-        cosine, sine = math.cos(radius_rad + reach_rad), math.sin(radius_rad + reach_rad)
+        cos_radius = self.cos_radius.take(hit)
+        sin_radius = self.sin_radius.take(hit)
+        cosine = math.cos(radius_rad + reach_rad)
+        sine = math.sin(radius_rad + reach_rad)
         within = axis @ centre >= cosine * cos_radius - sine * sin_radius
         if edges is not None and reach_rad < math.pi / 2:
-            cosine, sine = math.cos(reach_rad), math.sin(reach_rad)
+            cosine = math.cos(reach_rad)
+            sine = math.sin(reach_rad)
             deepest = cosine * sin_radius + sine * cos_radius
             if widest_rad + reach_rad >= math.pi / 2:
                 # a cell wider than a plane bounds
@@ -384,10 +402,8 @@ class CellGrid:
         end = start + self.count.take(cells)
         # neighbours in a band follow each other: few ranges
         gaps = (start[1:] != end[:-1]).nonzero()[0]
-        firsts, lasts = (
-            [int(start[0]), *start[gaps + 1].tolist()],
-            [*end[gaps].tolist(), int(end[-1])],
-        )
+        firsts = [int(start[0]), *start[gaps + 1].tolist()]
+        lasts = [*end[gaps].tolist(), int(end[-1])]
         return np.concatenate(
             [np.arange(first, last) for first, last in zip(firsts, lasts, strict=True)]
         )
@@ -435,8 +451,12 @@ def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     1.2.17.
     Nothing divides by cos(dec), so the poles are ordinary points.
     """
-    ra, dec = np.radians(catalog.ra_deg), np.radians(catalog.dec_deg)
-    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
+    ra = np.radians(catalog.ra_deg)
+    dec = np.radians(catalog.dec_deg)
+    sin_ra = np.sin(ra)
+    cos_ra = np.cos(ra)
+    sin_dec = np.sin(dec)
+    cos_dec = np.cos(dec)
     years = epoch_jyear - catalog.epoch_jyear
     east = catalog.pm_ra_cosdec_mas_yr * RAD_PER_MAS * years
     north = catalog.pm_dec_mas_yr * RAD_PER_MAS * years
@@ -462,6 +482,6 @@ def aberrate(
     beta = np.asarray(observer_velocity_km_s, dtype=np.float64) / LIGHT_KM_S
     gamma_inverse = np.sqrt(1.0 - beta @ beta)
     along = vectors @ beta
-    seen = gamma_inverse * vectors + (1.0 + along / (1.0 + gamma_inverse))[:, None] * beta
-    seen /= (1.0 + along)[:, None]
-    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+    apparent = gamma_inverse * vectors + (1.0 + along / (1.0 + gamma_inverse))[:, None] * beta
+    apparent /= (1.0 + along)[:, None]
+    return np.asarray(apparent / np.linalg.norm(apparent, axis=1, keepdims=True))

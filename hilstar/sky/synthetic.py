@@ -61,8 +61,9 @@ def colours(
     """The colours of BANDS and of "bolometric" (eq. 2.6, 2.7) against V, of the spectra that a
     bench gives its stars.
     """
-    johnson_v, light = read_curve_csv(DATA_DIR / "johnson-v.csv"), vega()
-    found: dict[str, Colour] = {}
+    johnson_v = read_curve_csv(DATA_DIR / "johnson-v.csv")
+    light = vega()
+    colour_by_name: dict[str, Colour] = {}
     for band in BANDS:
         passband = read_curve_csv(
             DATA_DIR / ("gaia-g.csv" if band == "g" else f"bessell-{band}.csv")
@@ -70,10 +71,11 @@ def colours(
         # Gaia's G counts photons, and Vega scaled to V = 0 has G = 0.
         weighting = "photon" if band == "g" else "energy"
         zero = curve_mean(light, passband, weighting) / curve_mean(light, johnson_v)
-        zero = zero if band == "g" else ZERO_W_M2_M[band] / electrons.VEGA_V0_W_M2_M
-        found[band] = _band(spectrum, temperature, passband, weighting, zero)
-    found["bolometric"] = _bolometric(spectrum, temperature, photometry)
-    return found
+        if band != "g":
+            zero = ZERO_W_M2_M[band] / electrons.VEGA_V0_W_M2_M
+        colour_by_name[band] = _band(spectrum, temperature, passband, weighting, zero)
+    colour_by_name["bolometric"] = _bolometric(spectrum, temperature, photometry)
+    return colour_by_name
 
 
 def _band(
@@ -108,7 +110,9 @@ def _band(
 
 
 def _spectra(spectrum: Spectrum) -> electrons.Library:
-    return bare_and_dusty() if spectrum == "mk" else electrons.load_library()
+    if spectrum == "mk":
+        return bare_and_dusty()
+    return electrons.load_library()
 
 
 def _by_library(spectrum: Spectrum, relative: FloatArray) -> Colour:
@@ -147,7 +151,8 @@ def library_exitance_m(library: electrons.Library) -> FloatArray:
     Beyond a spectrum's ends stands a black body of its B-V (Torres 2010), fitted to its last
     END_NM.
     """
-    nm, flux = library.wavelength_nm, library.flux
+    nm = library.wavelength_nm
+    flux = library.flux
     total = np.trapezoid(flux, nm, axis=1) * 1e-9
     kelvin = torres2010_k(np.clip(library.bv_mag, *TORRES_BV_MAG))[:, None]
     for ends, inside in (

@@ -186,7 +186,8 @@ def bv_from_vi(vi_mag: FloatArray) -> FloatArray:
 def _bv_along_vi() -> tuple[FloatArray, FloatArray]:
     stars = load_catalog()
     known = np.isfinite(stars.vi_mag)
-    bv_mag, vi_mag = stars.bv_mag[known], stars.vi_mag[known]
+    bv_mag = stars.bv_mag[known]
+    vi_mag = stars.vi_mag[known]
     order = np.argsort(vi_mag, kind="stable")
     bins, start = np.unique(np.round(vi_mag[order] / BIN_MAG), return_index=True)
     parts = zip(bins * BIN_MAG, np.split(bv_mag[order], start[1:]), strict=True)
@@ -440,11 +441,15 @@ def _read_fits(
         layout = layout_of(path, table.columns.names, roles)
         _check_rows(path, int(table.header["NAXIS2"]))
         by_name = {column.name: column for column in table.columns}
-        columns, unit = {}, {}
+        columns = {}
+        unit = {}
         for name in layout.needed():
             null = by_name[name].null
             values = np.asarray(table.data[name])
-            mask = values == null if null is not None and values.dtype.kind in "iu" else None
+            if null is not None and values.dtype.kind in "iu":
+                mask = values == null
+            else:
+                mask = None
             columns[name], unit[name] = (
                 _numbers(path, layout, name, values, mask),
                 by_name[name].unit or unit_by_name(name),
@@ -471,7 +476,8 @@ def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
         fields = {field.name: field for field in table.fields}
         layout = layout_of(path, list(fields), roles)
         _check_rows(path, len(table.array))
-        columns, unit = {}, {}
+        columns = {}
+        unit = {}
         for name in layout.needed():
             column = table.array[
                 fields[name].ID if fields[name].ID in (table.array.dtype.names or ()) else name
@@ -516,7 +522,8 @@ def _turn_of(unit: str | None) -> str | None:
 
 def _cells(column: Any, unit: str | None) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
     """A column's values and which are blank; sexagesimal ones as degrees."""
-    values, mask = np.asarray(column), np.ma.getmaskarray(column)
+    values = np.asarray(column)
+    mask = np.ma.getmaskarray(column)
     turn = _turn_of(unit)
     if turn is not None and values.dtype.kind == "U":
         values = _degrees(values, mask, turn)
@@ -558,7 +565,10 @@ def _chunks(table: TextTable, places: list[int]) -> Iterator[Any]:
     from astropy.io import ascii as text
 
     # A line that begins or ends with a tab has a blank cell there, and Astropy strips tabs.
-    delimiter = UNIT_SEPARATOR if table.delimiter == "\t" else table.delimiter
+    if table.delimiter == "\t":
+        delimiter = UNIT_SEPARATOR
+    else:
+        delimiter = table.delimiter
     for number, lines in table.blocks(CHUNK_BYTES):
         block = _plain_block(table, "".join(lines))
         if not block.strip():
@@ -589,7 +599,9 @@ def _plain_block(table: TextTable, block: str) -> str:
         block = ascii_text(block).encode("ascii", "replace").decode()
     if table.decimal_comma:
         block = block.replace(",", ".")
-    return block.replace("\t", UNIT_SEPARATOR) if table.delimiter == "\t" else block
+    if table.delimiter == "\t":
+        return block.replace("\t", UNIT_SEPARATOR)
+    return block
 
 
 def _even_block(table: TextTable, number: int, lines: list[str]) -> str:
@@ -617,7 +629,9 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
             [str(text).strip().encode("ascii", "replace") for text in values.tolist()],
             dtype=np.bytes_,
         )
-        return texts if mask is None else np.where(mask, b"", texts)
+        if mask is None:
+            return texts
+        return np.where(mask, b"", texts)
     whole = name in {layout.role.get(role) for role in Whole}
     if values.dtype.kind not in "iufb":
         raise InputError(
@@ -628,7 +642,9 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
         )
     if whole:
         plain = _whole_numbers(values)
-        return plain if mask is None else np.where(mask, 0, plain)
+        if mask is None:
+            return plain
+        return np.where(mask, 0, plain)
     figures = values.astype(np.float64)
     if mask is not None:
         figures[mask] = np.nan

@@ -101,7 +101,8 @@ def _table_17() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     lines = BRIGHTNESS.read_text().splitlines()
     lat_deg = np.array([float(name.split("_")[1]) for name in lines[1].split(",")[1:]])
     rows = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines[2:]])
-    dlon_deg, log_radiance = rows[:, 0], np.log(rows[:, 1:])
+    dlon_deg = rows[:, 0]
+    log_radiance = np.log(rows[:, 1:])
     blank = np.isnan(log_radiance)
     lon, lat = np.radians(np.broadcast_arrays(dlon_deg[:, None], lat_deg))
     vectors = np.stack([np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)], axis=-1)
@@ -120,12 +121,12 @@ def relative_spectrum(
     table = read_curve_csv(SPECTRUM)
     nodes = table.wavelength_nm
     over_sun = np.log(table.value / blackbody_exitance_w_m2_m(nodes, np.array(SUN_TEMPERATURE_K)))
-    found = blackbody_exitance_w_m2_m(wavelength_nm, np.array(SUN_TEMPERATURE_K))
-    found = found * np.exp(np.interp(np.log(wavelength_nm), np.log(nodes), over_sun))
+    exitance = blackbody_exitance_w_m2_m(wavelength_nm, np.array(SUN_TEMPERATURE_K))
+    exitance = exitance * np.exp(np.interp(np.log(wavelength_nm), np.log(nodes), over_sun))
     # Equation 22 with these slopes over that of 90 degrees.
     decades = np.log10(wavelength_nm / TABLE_NM)
     redder, far = (1 + np.where(decades < 0, *pair) * decades for pair in (slopes, FAR_SLOPES))
-    return np.asarray(found / table(np.array([TABLE_NM])) * (redder / far))
+    return np.asarray(exitance / table(np.array([TABLE_NM])) * (redder / far))
 
 
 @dataclass(frozen=True, slots=True)

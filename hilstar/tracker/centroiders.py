@@ -56,7 +56,8 @@ def star_places(
     The others begin there. Of a box those pixels count that have over `box_share` of its brightest.
     """
     lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
-    x, y = np.zeros(len(stamps)), np.zeros(len(stamps))
+    x = np.zeros(len(stamps))
+    y = np.zeros(len(stamps))
     kind = "fit" if kind == "psf" else kind
     if len(lit):
         rows, columns = brightest(stamps) if pixels is None else pixels
@@ -83,18 +84,16 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
             for dx, dy in ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
         ]
         parts = np.stack([shares, *slopes], axis=1).reshape(len(stamps), 3, -1)
-        normal, seen = (
-            parts @ parts.transpose(0, 2, 1),
-            (parts @ stamps.reshape(len(stamps), -1, 1)),
-        )
+        normal = parts @ parts.transpose(0, 2, 1)
+        right_side = parts @ stamps.reshape(len(stamps), -1, 1)
         normal += (
             np.eye(3)
             * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
         )
-        found = np.linalg.solve(normal, seen)[..., 0]  # flux, and flux times each step
+        solution = np.linalg.solve(normal, right_side)[..., 0]  # flux, and flux times each step
         # where there is no light, no step
-        flux = np.where(found[:, 0] > MIN_LIGHT, found[:, 0], np.inf)
-        dx, dy = (np.clip(found[:, k] / flux, -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
+        flux = np.where(solution[:, 0] > MIN_LIGHT, solution[:, 0], np.inf)
+        dx, dy = (np.clip(solution[:, k] / flux, -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
         x, y = (np.clip(place, -half, half) for place in (x + dx, y + dy))
         if not len(dx) or max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
             break
@@ -116,7 +115,8 @@ def _axis(stamps: FloatArray) -> FloatArray:
 
 
 def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
-    at, light = _axis(stamps), stamps.sum(axis=(1, 2))
+    at = _axis(stamps)
+    light = stamps.sum(axis=(1, 2))
     x, y = (
         np.clip(stamps.sum(axis=axis) @ at / light, at[0], at[-1]) for axis in (1, 2)
     )  # noise below 0 may leave little light
@@ -141,7 +141,8 @@ def _window(
             stamps, np.stack([down, at * down], axis=1), np.stack([across, at * across], axis=2)
         )
         light = np.maximum(sums[:, 0, 0], MIN_LIGHT)
-        dx, dy = PACE * (sums[:, 0, 1] / light - x), PACE * (sums[:, 1, 0] / light - y)
+        dx = PACE * (sums[:, 0, 1] / light - x)
+        dy = PACE * (sums[:, 1, 0] / light - y)
         x, y = (np.clip(place, at[0], at[-1]) for place in (x + dx, y + dy))
         if max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
             break
@@ -184,28 +185,28 @@ def _fit_step(
         [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))]
         for part in (across, down)
     )
-    one = flux * yy * xd, flux * yd * xx  # the star with its slopes
+    star_and_slopes = flux * yy * xd, flux * yd * xx  # the star with its slopes
     normal = np.stack(
         [
             xx * yy,
-            *one,
-            one[0],
+            *star_and_slopes,
+            star_and_slopes[0],
             flux**2 * yy * dd,
             flux**2 * yd * xd,
-            one[1],
+            star_and_slopes[1],
             flux**2 * yd * xd,
             flux**2 * ee * xx,
         ],
         axis=-1,
     ).reshape(-1, 3, 3)
-    left = (
+    unexplained = (
         np.stack([seen[:, 0, 0], flux * seen[:, 0, 1], flux * seen[:, 1, 0]], axis=-1)
         - flux[:, None] * normal[:, 0]
     )
     normal += (
         np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
     )
-    return np.asarray(np.linalg.solve(normal, left[..., None])[..., 0])
+    return np.asarray(np.linalg.solve(normal, unexplained[..., None])[..., 0])
 
 
 def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> Places:
@@ -220,7 +221,8 @@ def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE
     rows, columns = pixels
     side = stamps.shape[1]
     near = np.arange(-half, half + 1)
-    y, x = rows[:, None, None] + near[:, None], columns[:, None, None] + near
+    y = rows[:, None, None] + near[:, None]
+    x = columns[:, None, None] + near
     box = stamps[np.arange(len(stamps))[:, None, None], y, x]
     box = np.where(box > share * box.max(axis=(1, 2), keepdims=True), box, 0.0)
     light = np.maximum(box.sum(axis=(1, 2)), MIN_LIGHT)

@@ -163,11 +163,12 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     sigma = MAD_TO_SIGMA * _median(np.abs(values - median), counts)
     # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its
     # counterpart on the other.
-    kept = np.abs(values - median) <= CLIP_SIGMAS * max(sigma, step)
-    shares = None if counts is None else counts[kept]
-    level = float(np.average(values[kept], weights=shares))
+    is_background = np.abs(values - median) <= CLIP_SIGMAS * max(sigma, step)
+    shares = None if counts is None else counts[is_background]
+    level = float(np.average(values[is_background], weights=shares))
     noise = (
-        math.sqrt(float(np.average((values[kept] - level) ** 2, weights=shares))) / CLIPPED_SIGMA
+        math.sqrt(float(np.average((values[is_background] - level) ** 2, weights=shares)))
+        / CLIPPED_SIGMA
     )
     return LocalBackground(level, max(noise, step / math.sqrt(12)))
 
@@ -176,7 +177,8 @@ def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
     """The values in an image of DN, in order, and how many pixels have each: ten times faster
     than pixel by pixel.
     """
-    flat, counts = image.ravel(), np.zeros(int(image.max()) + 1, dtype=np.intp)
+    flat = image.ravel()
+    counts = np.zeros(int(image.max()) + 1, dtype=np.intp)
     # whose whole numbers of 64 bits stay in a core's cache
     for begin in range(0, len(flat), COUNTED_AT_ONCE):
         counts += np.bincount(flat[begin : begin + COUNTED_AT_ONCE], minlength=len(counts))
@@ -202,9 +204,13 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     noise at all.
     """
     # First, for a median takes a copy of the image.
-    level = _median(*_counted(image)) if image.dtype in COUNTED_TYPES else float(np.median(image))
+    if image.dtype in COUNTED_TYPES:
+        level = _median(*_counted(image))
+    else:
+        level = float(np.median(image))
     rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
-    height, width = image.shape[0] // rows, image.shape[1] // columns
+    height = image.shape[0] // rows
+    width = image.shape[1] // columns
     blocks = (
         image[: rows * height, : columns * width]
         .reshape(rows, height, columns, width)
@@ -216,10 +222,10 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     off = np.abs(values)
     # The median deviation of whole steps is a whole one: half a step more, so that nothing of the
     # noise is cut off.
-    kept = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
-    values *= kept
+    is_background = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
+    values *= is_background
     squares = np.einsum("ij,ij->i", values, values, dtype=np.float64)
-    noise = np.sqrt(squares / kept.sum(axis=1)) / CLIPPED_SIGMA
+    noise = np.sqrt(squares / is_background.sum(axis=1)) / CLIPPED_SIGMA
     return LocalBackground(
         level, max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12))
     )
@@ -300,19 +306,19 @@ def _find_blobs(
     from scipy.ndimage import label
 
     above = image > cut
-    labels, found = label(above, structure=WITH_DIAGONALS)
+    labels, blob_count = label(above, structure=WITH_DIAGONALS)
     lit = np.flatnonzero(above)
     y, x = np.divmod(lit, image.shape[1])
     blob = labels.ravel()[lit].astype(np.intp) - 1
     value = image.ravel()[lit].astype(np.float64) - level
-    pixels = np.bincount(blob, minlength=found)
-    flux = np.bincount(blob, value, minlength=found)
-    peak = np.zeros(found)
+    pixels = np.bincount(blob, minlength=blob_count)
+    flux = np.bincount(blob, value, minlength=blob_count)
+    peak = np.zeros(blob_count)
     np.maximum.at(peak, blob, value)
     # Everything above a threshold of 0 or more is positive, so no blob's flux is 0.
-    x_px, y_px = (np.bincount(blob, value * place, minlength=found) / flux for place in (x, y))
-    kept = pixels >= minimum_pixels
-    return _Blobs(x_px[kept], y_px[kept], peak[kept], pixels[kept])
+    x_px, y_px = (np.bincount(blob, value * place, minlength=blob_count) / flux for place in (x, y))
+    is_large = pixels >= minimum_pixels
+    return _Blobs(x_px[is_large], y_px[is_large], peak[is_large], pixels[is_large])
 
 
 def squares(
@@ -393,7 +399,8 @@ def _plain_centres(
     A square without light, or whose centre of gravity lies outside it, leaves the blob's own.
     """
     start = np.stack([blobs.x_px, blobs.y_px])
-    place, middle = start, np.rint(start)
+    place = start
+    middle = np.rint(start)
     for _ in range(settings.iterations):
         values, dx, dy = squares(image, level, middle[0], middle[1], settings.radius_px)
         total = values.sum(axis=(1, 2))

@@ -216,11 +216,9 @@ class Detector:
                 )
 
         draw_blocks(self.shape, rng, draw)
-        return (
-            self._read_out(bloom(spilt_e, settings.full_well_e), normal)
-            if settings.blooming
-            else codes
-        )
+        if settings.blooming:
+            return self._read_out(bloom(spilt_e, settings.full_well_e), normal)
+        return codes
 
     def _expose_by_generator(
         self, light_e: FloatArray, exposure_s: float, rng: np.random.Generator
@@ -305,11 +303,9 @@ class Detector:
 
     def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:
         full_e = self.settings.full_well_e
-        return (
-            bloom(collected_e, full_e)
-            if self.settings.blooming
-            else np.minimum(collected_e, full_e)
-        )
+        if self.settings.blooming:
+            return bloom(collected_e, full_e)
+        return np.minimum(collected_e, full_e)
 
     def _convert(self, charge_e: ChargeArray) -> CodeArray:
         """The ADC: electrons to the nearest code (a half goes to the even one), clipped to the
@@ -337,7 +333,8 @@ def _dark_map_e_per_s(
     Where DSNU is not small beside dark, the normal law's cut at 0 lifts the mean: 1e-4 of it for
     table 4.2 (203 and 60 e-/s).
     """
-    mean, sigma = settings.dark_e_per_s, settings.dsnu_e_per_s
+    mean = settings.dark_e_per_s
+    sigma = settings.dsnu_e_per_s
     rate_e_per_s = np.full(shape, mean)
     if sigma and settings.dark_distribution == "gamma":
         rate_e_per_s = dsnu.gamma((mean / sigma) ** 2, sigma**2 / mean, shape)

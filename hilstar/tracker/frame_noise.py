@@ -56,13 +56,12 @@ def normal_pairs(
     `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
     """
     parts = words.shape[0] if words.ndim == 3 else 1
-    halves, shape = words.view(np.uint32).reshape(parts, 2, -1), words.shape
+    halves = words.view(np.uint32).reshape(parts, 2, -1)
+    shape = words.shape
     if which is not None:
         part, place = np.divmod(which, halves.shape[2])
-        halves, shape = (
-            np.stack([halves[part, 0, place], halves[part, 1, place]])[None],
-            which.shape,
-        )
+        halves = np.stack([halves[part, 0, place], halves[part, 1, place]])[None]
+        shape = which.shape
     radius = halves[:, 0].astype(np.float32).reshape(shape)
     radius += np.float32(0.5)
     radius *= np.float32(2.0**-32)
@@ -87,7 +86,8 @@ def poisson(
     """
     bright = mean_e != 0
     if np.count_nonzero(bright) < mean_e.size / 2:
-        lit, counts = np.flatnonzero(bright), np.zeros_like(mean_e)
+        lit = np.flatnonzero(bright)
+        counts = np.zeros_like(mean_e)
         counts.ravel()[lit] = poisson(mean_e.ravel()[lit], normal.ravel()[lit], 0.0)
         return counts
     is_large = mean_e >= TABLE_BELOW_E
@@ -123,12 +123,14 @@ def _by_table(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
     place *= np.float32(COLUMNS)
     place += normal * np.float32(COLUMNS_PER_SIGMA)
     place += np.float32(COLUMNS / 2)
-    found = table.cells.take(place.astype(np.intp))
-    counts = (found & (UNSURE - 1)).astype(np.float32)
-    doubts = np.flatnonzero(found >= UNSURE)
-    numbers, rows = normal.ravel()[doubts], mean_e.ravel()[doubts] * ROWS_PER_E
+    cells = table.cells.take(place.astype(np.intp))
+    counts = (cells & (UNSURE - 1)).astype(np.float32)
+    doubts = np.flatnonzero(cells >= UNSURE)
+    numbers = normal.ravel()[doubts]
+    rows = mean_e.ravel()[doubts] * ROWS_PER_E
     step = rows.astype(np.intp) * UNSURE + counts.ravel()[doubts].astype(np.intp)
-    low, high = table.step_number.take(step), table.step_number.take(step + UNSURE)
+    low = table.step_number.take(step)
+    high = table.step_number.take(step + UNSURE)
     above = numbers - (low + (rows - np.floor(rows)) * (high - low))
     sure = (
         (np.abs(above) > STEP_NUMBER_ERROR)
@@ -164,11 +166,10 @@ def _by_expansion(mean_e: Float32Array, normal: Float32Array, smallest_e: float)
     bend *= np.float32(ERROR_PER_BEND2)
     quantile += bend
     doubts = np.flatnonzero(quantile > 0.5 - ERROR_E_TIMES_MEAN / smallest_e)
-    means, numbers = (
-        mean_e.ravel()[doubts].astype(np.float64),
-        normal.ravel()[doubts].astype(np.float64),
-    )
-    square, root = numbers**2, np.sqrt(means)
+    means = mean_e.ravel()[doubts].astype(np.float64)
+    numbers = normal.ravel()[doubts].astype(np.float64)
+    square = numbers**2
+    root = np.sqrt(means)
     bends = numbers * (2 + square) / (72 * root)
     finer = (
         means
@@ -197,10 +198,8 @@ def _decide(
     from scipy.special import ndtr, pdtr
 
     numbers = normal.ravel()[doubts]
-    means, counted = (
-        mean_e.ravel()[doubts].astype(np.float64),
-        np.maximum(counts.ravel()[doubts], 0.0).astype(np.float64),
-    )
+    means = mean_e.ravel()[doubts].astype(np.float64)
+    counted = np.maximum(counts.ravel()[doubts], 0.0).astype(np.float64)
     low = pdtr(counted, means) < ndtr(numbers.astype(np.float64))
     counted += low
     climbing = np.flatnonzero(low & (np.abs(numbers) > ONE_STEP_SIGMAS))

@@ -101,16 +101,18 @@ def identify(
         if step == 0 and len(pairs) >= MIN_STARS:
             moved = np.stack([found.x_px[pairs], found.y_px[pairs]], axis=1) - expected[known]
             alike = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < RADII_PX[1]
-            pairs, known = pairs[alike], known[alike]
+            pairs = pairs[alike]
+            known = known[alike]
         if len(pairs) < max(MIN_STARS, MIN_SHARE * min(len(found), len(directions)) * (step > 0)):
             return None
         q = wahba(found.rays[pairs], directions[known], weight[pairs])
     for _ in range(REFITS):  # a neighbour in a star's window pulls it away from where it is
         off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
-        kept = off**2 * weight[pairs] <= REJECTED**2 * np.median(off**2 * weight[pairs])
-        if kept.all() or kept.sum() < MIN_STARS:
+        is_close = off**2 * weight[pairs] <= REJECTED**2 * np.median(off**2 * weight[pairs])
+        if is_close.all() or is_close.sum() < MIN_STARS:
             break
-        pairs, known = pairs[kept], known[kept]
+        pairs = pairs[is_close]
+        known = known[is_close]
         q = wahba(found.rays[pairs], directions[known], weight[pairs])
     off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
     return Identified(q, pairs, star[known], float(np.sqrt(np.mean(off**2) / 2)))
@@ -174,6 +176,6 @@ class LostInSpace:
         """
         places = np.column_stack([slopes * self._camera.focal_length_px, flux_e])
         solved = self._database.solve_from_centroids(places, camera_model=self._camera)
-        return (
-            normalise(np.asarray(solved.quaternion)) if isinstance(solved, self._result) else None
-        )
+        if isinstance(solved, self._result):
+            return normalise(np.asarray(solved.quaternion))
+        return None

@@ -28,13 +28,13 @@ def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArr
     if bayer is None:
         (image,) = images
         return image
-    found = np.empty(0)
+    mosaic = np.empty(0)
     for channel, image in zip(CHANNELS, images, strict=True):
-        if not found.size:
-            found = np.empty(image.shape)
+        if not mosaic.size:
+            mosaic = np.empty(image.shape)
         for part in of_colour(bayer, channel):
-            found[part] = image[part]
-    return found
+            mosaic[part] = image[part]
+    return mosaic
 
 
 def of_colour(bayer: str, channel: str) -> list[tuple[slice, slice]]:
@@ -65,7 +65,9 @@ def software_image(dn: npt.NDArray[Any], detector: DetectorSettings) -> npt.NDAr
     """The image of an exposure in which a tracker's software finds stars: its DN, or the
     luminance of its superpixels.
     """
-    return luminance(dn) if detector.takes_superpixels else dn
+    if detector.takes_superpixels:
+        return luminance(dn)
+    return dn
 
 
 def software_psf_px(psf_px: tuple[float, float], detector: DetectorSettings) -> tuple[float, float]:
@@ -85,4 +87,6 @@ def uneven_dark_dn(under_e: FloatArray, detector: DetectorSettings) -> FloatArra
     """
     dark_dn = detector.offset_dn + under_e / detector.gain_e_per_dn
     dark_dn = software_image(np.clip(dark_dn, 0.0, 2.0**detector.bits - 1), detector)
-    return dark_dn if np.ptp(dark_dn) > EVEN_DARK_DN else None
+    if np.ptp(dark_dn) > EVEN_DARK_DN:
+        return dark_dn
+    return None

@@ -38,7 +38,9 @@ def before_adc_dn(variance_dn2: float, stated_dn: float) -> float:
     the larger is the error of rounding.
     """
     read_dn = math.sqrt(max(variance_dn2 - VARIANCE_DN2, 0.0))
-    return min(read_dn, stated_dn) if variance_dn2 < AMBIGUOUS_DN2 else read_dn
+    if variance_dn2 < AMBIGUOUS_DN2:
+        return min(read_dn, stated_dn)
+    return read_dn
 
 
 def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
@@ -87,7 +89,8 @@ def cut_mean_dn(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
 
 def uncut_level_dn(mean_dn: float, noise_dn: float) -> float:
     """The level whose mean is `mean_dn` when its noise is cut off at 0, DN."""
-    lowest_dn, highest_dn = -5.0 * noise_dn, mean_dn + noise_dn
+    lowest_dn = -5.0 * noise_dn
+    highest_dn = mean_dn + noise_dn
 
     def excess_dn(level_dn: float) -> float:
         return float(cut_mean_dn(np.array(level_dn), np.array(noise_dn))) - mean_dn

@@ -206,7 +206,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """What the temperature does to dark rates: 1 at the reference temperature (thesis eq.
         4.12).
         """
-        cold_k, warm_k = self.dark_reference_temperature_k, self.temperature_k
+        cold_k = self.dark_reference_temperature_k
+        warm_k = self.temperature_k
         if self.dark_law == "arrhenius":
             return _arrhenius(self.dark_activation_ev, cold_k, warm_k)
         if self.dark_law in E2V_DARK:
@@ -299,7 +300,10 @@ _KINDS = get_type_hints(DetectorSettings, include_extras=True)
 def _check_shutter(detector: DetectorSettings) -> None:
     for name, shutter in (("row_time_us", "rolling"), ("row_shift_us", "frame-transfer")):
         if (getattr(detector, name) > 0) != (detector.shutter == shutter):
-            way = "above 0" if detector.shutter == shutter else f'= 0, or shutter = "{shutter}"'
+            if detector.shutter == shutter:
+                way = "above 0"
+            else:
+                way = f'= 0, or shutter = "{shutter}"'
             raise InputError(
                 f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write'
                 f" {name} {way}"

@@ -93,7 +93,8 @@ class Judge:
         self._box_share = box_share
         self._count = len(places_px[0])
         self._phases = phases or (spread_phases(self._count),) * 2
-        self._tile, self._pixel_px = len(wanted) // self._count, pixel_px
+        self._tile = len(wanted) // self._count
+        self._pixel_px = pixel_px
         self._in_tile_px = [place - self._tile * np.arange(self._count) for place in places_px]
         self._sampled_px = max(pixel_px, FINEST_PX)
         x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) for sigma in sigma_px)
@@ -130,10 +131,8 @@ class Judge:
         """The stars' places (2, n), px, from where the tracker's pixel in the middle is."""
         if kind == "moment":  # no blur and no pixel changes it
             tiles = self._tiles(image, self._tile)
-            at, light = (
-                np.arange(self._tile),
-                np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny),
-            )
+            at = np.arange(self._tile)
+            light = np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
             return np.stack([tiles.sum(axis=1) @ at / light, tiles.sum(axis=2) @ at / light])
         boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
@@ -200,9 +199,11 @@ def stamp_errors(
     """
     count, side = wanted.shape[:2]
     phases = spread_phases(count)
-    at, light = np.arange(side), wanted.sum(axis=(1, 2))
+    at = np.arange(side)
+    light = wanted.sum(axis=(1, 2))
     middles = wanted.sum(axis=1) @ at / light, wanted.sum(axis=2) @ at / light
-    sampled_px, blur_px = max(pixel_px, FINEST_PX), max(blur_px, MIN_BLUR_PX)
+    sampled_px = max(pixel_px, FINEST_PX)
+    blur_px = max(blur_px, MIN_BLUR_PX)
     x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) / sampled_px for sigma in sigma_px)
 
     def seen(images: FloatArray, width_px: float, half: int) -> FloatArray:

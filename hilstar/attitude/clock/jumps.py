@@ -87,15 +87,14 @@ class _TimeSteps:
         self._last: AttitudeSample | None = None
         self._usual_ns: deque[float] = deque(maxlen=STEPS)
         # the newest step of t_ns, and how many packets it spans
-        self._newest_ns, self._packets = 0, 1
+        self._newest_ns = 0
+        self._packets = 1
 
     def add(self, sample: AttitudeSample) -> None:
         if self._last is not None:
             packets = sample.sequence - self._last.sequence
-            self._newest_ns, self._packets = (
-                sample.t_ns - self._last.t_ns,
-                packets if 1 <= packets <= MAX_MISSING else 1,
-            )
+            self._newest_ns = sample.t_ns - self._last.t_ns
+            self._packets = packets if 1 <= packets <= MAX_MISSING else 1
             self._usual_ns.append(self._newest_ns / self._packets)
         self._last = sample
 
@@ -160,7 +159,8 @@ class JumpFilter:
     def __init__(self, clock: SenderClock, state: StreamState) -> None:
         self.correction_ns = 0  # continuous time minus the sender's
         self.jumps = 0
-        self._clock, self._state = clock, state
+        self._clock = clock
+        self._state = state
         self._pace = _Pace()
         self._steps = _TimeSteps()
         self._usual_ns: deque[float] = deque(maxlen=256)  # delays that raise no doubt
@@ -202,8 +202,8 @@ class JumpFilter:
             <= self._late_limit_ns(arrival.host_ns) + arrival.waited_ns
         ):
             # Nothing to doubt; so early ones in doubt were wrong.
-            refused = [_too_early(each) for each in self._doubtful if each.late_ns < 0]
-            self._doubtful = [each for each in self._doubtful if each.late_ns >= 0]
+            refused = [_too_early(doubt) for doubt in self._doubtful if doubt.late_ns < 0]
+            self._doubtful = [doubt for doubt in self._doubtful if doubt.late_ns >= 0]
             return [*refused, *self.release(), self._accept(arrival)]
         decided: list[SampleArrival] = []
         if self._doubtful and not self._agrees(arrival, late_ns):
@@ -224,19 +224,24 @@ class JumpFilter:
 
     def release(self) -> list[SampleArrival]:
         """The samples in doubt, as they are."""
-        released = [self._accept(each.arrival) for each in self._doubtful]
+        released = [self._accept(doubt.arrival) for doubt in self._doubtful]
         self._doubtful.clear()
         return released
 
     def _late_limit_ns(self, host_ns: int) -> float:
         """How late a message may be without doubt, after the silence before it."""
-        silent_ns = 0 if self._near_ns is None else host_ns - self._near_ns
+        if self._near_ns is None:
+            silent_ns = 0
+        else:
+            silent_ns = host_ns - self._near_ns
         return self._limit_ns + UNKNOWN_DRIFT * silent_ns
 
     def _early_limit_ns(self, host_ns: int) -> float:
         if self._clock.unheard:
             return MAX_GUESSED_LATE_NS
-        return self._late_limit_ns(host_ns) if self.settled else MAX_FOUND_LATE_NS
+        if self.settled:
+            return self._late_limit_ns(host_ns)
+        return MAX_FOUND_LATE_NS
 
     def _agrees(self, arrival: SampleArrival, late_ns: float) -> bool:
         """True where this one supports the samples in doubt: it is off by the same time, and
@@ -284,7 +289,7 @@ class JumpFilter:
         """The samples in doubt where they prove a jump, on a clock that is carried across it;
         else [].
         """
-        late_ns = [each.late_ns for each in self._doubtful]
+        late_ns = [doubt.late_ns for doubt in self._doubtful]
         for_ns = host_ns - self._doubtful[0].arrival.host_ns
         if self._shows_none and not self._state.resumed:
             is_jump = for_ns >= CLEARLY_LATE_FOR_NS
@@ -334,7 +339,8 @@ class KnownClockFilter:
     slowness = 0.0
 
     def __init__(self, notices: Notices, clock: SenderClock) -> None:
-        self._notices, self._clock = notices, clock
+        self._notices = notices
+        self._clock = clock
         self._off_since_ns: int | None = None
         self._shared_since_ns: int | None = None
         self._off = 0
@@ -347,10 +353,12 @@ class KnownClockFilter:
         """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the
         clock's.
         """
-        t_ns, host_ns = arrival.event.t_ns, arrival.host_ns
+        t_ns = arrival.event.t_ns
+        host_ns = arrival.host_ns
         late_ns = round(self._clock.latency_ns(t_ns, host_ns) or 0.0)
         if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
-            self._off_since_ns, self._off = None, 0
+            self._off_since_ns = None
+            self._off = 0
             self._shared(host_ns)
             self._look_behind(late_ns, host_ns)
             return [arrival]
@@ -358,7 +366,8 @@ class KnownClockFilter:
         # A link and a busy machine make packets late, and never early: the least late one is the
         # clock's.
         if self._off_since_ns is None:
-            self._off_since_ns, self._least_late_ns = host_ns, late_ns
+            self._off_since_ns = host_ns
+            self._least_late_ns = late_ns
         self._least_late_ns = min(self._least_late_ns, late_ns)
         self._off += 1
         for_ns = AHEAD_FOR_NS if late_ns < 0 else PERSISTENT_NS

@@ -99,25 +99,29 @@ class TimeUnit:
         self._first: tuple[int, int] | None = None
         self._last_ns = 0
         self._packets = self._others = 0
-        self.named, self._named_pace = "", 1.0
+        self.named = ""
+        self._named_pace = 1.0
 
     def see(self, t_ns: int, host_ns: int) -> None:
         """Take the next packet's time as it was sent, and its arrival."""
         first = self._first
         if first is None or host_ns - self._last_ns > MAX_PACE_GAP_NS or t_ns < first[0]:
-            self._first, self._packets = (t_ns, host_ns), 0
+            self._first = (t_ns, host_ns)
+            self._packets = 0
             self._last_ns = host_ns
             return
         self._last_ns = host_ns
         self._packets += 1
-        passed_ns, ticks = host_ns - first[1], t_ns - first[0]
+        passed_ns = host_ns - first[1]
+        ticks = t_ns - first[0]
         if (
             passed_ns < MIN_PACE_NS
             or self._packets < MIN_PACE_PACKETS
             or (ticks < MIN_TICKS and passed_ns < PATIENCE_NS)
         ):
             return
-        self._first, self._packets = (t_ns, host_ns), 0
+        self._first = (t_ns, host_ns)
+        self._packets = 0
         if ticks > 1:
             self._judge(ticks / passed_ns, UNIT_SHARE + 1 / ticks)
 
@@ -129,7 +133,9 @@ class TimeUnit:
                     f"t_ns runs at {pace:.3g} times real time: it is in {name}, not in nanoseconds;"
                     f" {send}"
                 )
-                self.named, self._named_pace, self._others = name, unit_pace, 0
+                self.named = name
+                self._named_pace = unit_pace
+                self._others = 0
                 self._notices.begin(UNIT, line)
                 return
         if self.named and abs(pace / self._named_pace - 1) < NAMED_SHARE:

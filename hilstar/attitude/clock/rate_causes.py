@@ -97,7 +97,10 @@ class ReadAs:
         """How a source of these conventions is read, where `convention` and `mounting` are
         stated.
         """
-        q_body_to_cam = mounting.q_body_to_cam if conventions.of_body else None
+        if conventions.of_body:
+            q_body_to_cam = mounting.q_body_to_cam
+        else:
+            q_body_to_cam = None
         if not conventions.of_packets:
             return cls(q_body_to_cam=q_body_to_cam, has_key=False)
         return cls(convention.scalar, convention.direction, q_body_to_cam, stated_by=stated_by)
@@ -131,7 +134,7 @@ def _scalar_last(q: FloatArray) -> FloatArray:
 
 def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
     """The other readings of quaternions that are read like this."""
-    found, scalar, direction, mounting = (
+    readings_by_text, scalar, direction, mounting = (
         [],
         read_as.scalar,
         read_as.direction,
@@ -153,15 +156,15 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
         def read(
             q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar
         ) -> FloatArray:
-            own = q if mounting is None else multiply(conjugate(mounting), q)
-            sent = conjugate(own) if direction == "cam_to_icrs" else own
+            own_q = q if mounting is None else multiply(conjugate(mounting), q)
+            sent = conjugate(own_q) if direction == "cam_to_icrs" else own_q
             sent = np.roll(sent, -1, axis=-1) if scalar == "last" else sent
             sent = np.roll(sent, 1, axis=-1) if to == "last" else sent
-            own = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
-            return own if mounting is None else multiply(mounting, own)
+            own_q = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
+            return own_q if mounting is None else multiply(mounting, own_q)
 
-        found.append(Reading(text, read_as.advice(parts), read))
-    return tuple(found)
+        readings_by_text.append(Reading(text, read_as.advice(parts), read))
+    return tuple(readings_by_text)
 
 
 @dataclass(slots=True)
@@ -198,14 +201,14 @@ class Stretch:
 
     def turn_as(self, reading: Reading) -> FloatArray:
         """The turn (3,) of its quaternions in another reading of their numbers."""
-        found = self._read.get(reading.text)
-        if found is None:
+        turn_rad_s = self._read.get(reading.text)
+        if turn_rad_s is None:
             turned = np.cumsum(_turns_rad(reading.read(self.q))[self.whole], axis=0)
             weight = self.at_s - self.at_s.mean()
-            found = self._read[reading.text] = np.asarray(
+            turn_rad_s = self._read[reading.text] = np.asarray(
                 weight[1:] @ turned / float(weight @ weight)
             )
-        return found
+        return turn_rad_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +236,14 @@ class Cause:
 
     def error(self, stretch: Stretch) -> float:
         """How far turn and rate of a stretch are apart without it, rad/s."""
-        turn = stretch.turn if self.reading is None else stretch.turn_as(self.reading)
-        sent = stretch.rate_as_icrs if self.in_icrs else stretch.rate
+        if self.reading is None:
+            turn = stretch.turn
+        else:
+            turn = stretch.turn_as(self.reading)
+        if self.in_icrs:
+            sent = stretch.rate_as_icrs
+        else:
+            sent = stretch.rate
         mended = self.mends @ sent
         if self.constant is not None:
             mended = mended - self.constant
@@ -279,11 +288,10 @@ def _permutations() -> Iterator[Cause]:
             sent = ", ".join(
                 ("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3)
             )
-            what = (
-                "some of their axes have the wrong sign"
-                if order == (0, 1, 2)
-                else "their axes are in another order"
-            )
+            if order == (0, 1, 2):
+                what = "some of their axes have the wrong sign"
+            else:
+                what = "their axes are in another order"
             for unit, size in DEGREES:
                 yield Cause(
                     f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)",
@@ -370,7 +378,9 @@ def cause_of(
         coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(
             np.linalg.norm(s.turn) for s in stretches
         )
-        return Cause("they are zero; leave them out", SAME) if coherent else None
+        if coherent:
+            return Cause("they are zero; leave them out", SAME)
+        return None
     sharp = all(FIT_SIGMA * _noise_of(s) < SHARP_SHARE * _turning(s) for s in stretches)
     read = next((cause for cause in others if _explains(stretches, cause, AXES_SHARE)), None)
     if read is not None and not sharp and length_s < LONGEST_S:
@@ -384,10 +394,9 @@ def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
     """
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
     errors = [cause.error(stretch) for stretch in stretches]
-    fitting = [
-        error <= _limit(s, share, FIT_SIGMA, cause.scale)
-        for s, error in zip(stretches, errors, strict=True)
-    ]
+    fitting = []
+    for s, error in zip(stretches, errors, strict=True):
+        fitting.append(error <= _limit(s, share, FIT_SIGMA, cause.scale))
     return fitting.count(False) <= len(stretches) // MORE_STRETCHES and off >= MIN_BETTER * float(
         np.median(errors)
     )
@@ -399,7 +408,10 @@ def _definite(stretches: Sequence[Stretch], read: Cause | None, sharp: bool) -> 
     `read` is the other reading of the quaternions that does; `sharp` says that noise hides no other
     turn.
     """
-    other = "" if read is None or read.reading is None else f", or {_stated(read.reading)}"
+    if read is None or read.reading is None:
+        other = ""
+    else:
+        other = f", or {_stated(read.reading)}"
     for cause in CAUSES:
         if _explains(stretches, cause, FIT_SHARE):
             # Of a turn about an axis that both readings share nothing tells a sign from a
@@ -408,10 +420,12 @@ def _definite(stretches: Sequence[Stretch], read: Cause | None, sharp: bool) -> 
     if read is not None and sharp:
         return read
     sharp = all(FIT_SIGMA * _noise_of(s) < FIT_SHARE * _faster(s) for s in stretches)
-    found = [cause for cause in PERMUTATIONS if _explains(stretches, cause, AXES_SHARE)]
-    if not found:
+    causes = [cause for cause in PERMUTATIONS if _explains(stretches, cause, AXES_SHARE)]
+    if not causes:
         return read
-    return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES + other)
+    if sharp and len(causes) == 1:
+        return causes[0]
+    return replace(causes[0], text=OTHER_AXES + other)
 
 
 def _stated(reading: Reading) -> str:
@@ -463,7 +477,9 @@ def _constant(stretches: Sequence[Stretch], off: FloatArray) -> Cause | None:
     cause = Cause(
         f"a constant ({x:.3g}, {y:.3g}, {z:.3g}) deg/s is added to them", SAME, constant=constant
     )
-    return cause if _explains(stretches, cause, AXES_SHARE) else None
+    if _explains(stretches, cause, AXES_SHARE):
+        return cause
+    return None
 
 
 def off_share(stretch: Stretch) -> float:
@@ -499,7 +515,10 @@ def _noise_of(stretch: Stretch) -> float:
 
 def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
     """How far turn and rate may be apart: a share of the turn, and the noise of both."""
-    size = _faster(stretch) if scale == 1.0 else _turning(stretch)
+    if scale == 1.0:
+        size = _faster(stretch)
+    else:
+        size = _turning(stretch)
     return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
 
 
@@ -520,7 +539,10 @@ class LagFit(NamedTuple):
     def lag_text(self) -> str:
         """The lag in words; at the end of those that are tried it may be a longer one."""
         sense = "late" if self.lag_s > 0 else "early"
-        more = " or more" if abs(self.lag_s) > MAX_LAG_S - LAG_STEPS_S[0] else ""
+        if abs(self.lag_s) > MAX_LAG_S - LAG_STEPS_S[0]:
+            more = " or more"
+        else:
+            more = ""
         return f"{abs(self.lag_s) * NS_PER_S / NS_PER_MS:.0f} ms {sense}{more}"
 
 
@@ -534,10 +556,8 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     if not stretches or stretches[-1].to_ns - stretches[0].from_ns < MIN_HISTORY_S * NS_PER_S:
         return None
     # The stretches' own figures say at little cost that there is nothing to look for.
-    fast, off = (
-        _turning_median(stretches),
-        float(np.median([stretch.error for stretch in stretches])),
-    )
+    fast = _turning_median(stretches)
+    off = float(np.median([stretch.error for stretch in stretches]))
     if off <= 0.5 * max(MIN_OFF_RAD_S, OFF_SHARE * fast):
         return LagFit(fast, off)
     zero_ns = stretches[0].from_ns
@@ -568,12 +588,15 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     lag_s = _least(lags_s, off_by(lags_s))
     near_s = lag_s + np.arange(-LAG_STEPS_S[0], LAG_STEPS_S[0] + LAG_STEPS_S[1] / 2, LAG_STEPS_S[1])
     near_s = near_s[np.abs(near_s) <= MAX_LAG_S]
-    left = off_by(near_s)
+    rest_rad_s = off_by(near_s)
     explained = (
-        float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise))
+        float(rest_rad_s.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise))
         and abs(lag_s) >= MIN_LAG_S
     )
-    lag_s = float(near_s[left.argmin()]) if explained else 0.0
+    if explained:
+        lag_s = float(near_s[rest_rad_s.argmin()])
+    else:
+        lag_s = 0.0
     return LagFit(fast, off, is_off=True, lag_s=lag_s)
 
 

@@ -71,7 +71,8 @@ def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) ->
     """The first cause that a log's samples show, all of which have rates; None where they show
     none.
     """
-    length, others = _Length(0.0), tuple(read_otherwise(readings(read_as)))
+    length = _Length(0.0)
+    others = tuple(read_otherwise(readings(read_as)))
     for sample in samples:
         if length.add(sample) and (cause := _first_cause(length, math.inf, others)) is not None:
             return cause
@@ -93,7 +94,8 @@ def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -
 
 class _Length:
     def __init__(self, length_s: float) -> None:
-        self.length_s, self._length_ns = length_s, round(length_s * NS_PER_S)
+        self.length_s = length_s
+        self._length_ns = round(length_s * NS_PER_S)
         self.samples: list[AttitudeSample] = []
         self.stretches: deque[Stretch] = deque(maxlen=MANY_STRETCHES)
 
@@ -111,7 +113,9 @@ class _Length:
         return True
 
     def newest(self, count: int) -> list[Stretch]:
-        return list(self.stretches)[-count:] if len(self.stretches) >= count else []
+        if len(self.stretches) >= count:
+            return list(self.stretches)[-count:]
+        return []
 
 
 class _History:
@@ -239,44 +243,45 @@ class RateCheck:
             self._begin(cause, newest[-1], newest[0].from_ns, host_ns)
 
     def _judge_lag(self, stretch: Stretch, host_ns: int | None) -> None:
-        found = self._history.add(stretch)
-        if found is None:
+        lag = self._history.add(stretch)
+        if lag is None:
             return
-        self._off_looks = self._off_looks + 1 if found.is_off else 0
-        if self.cause is None and (found.lag_s or self._off_looks == OFF_LOOKS):
-            self._late = found
-            late = f"they are {found.lag_text}: they fit the turn of another moment"
-            cause = Cause(late if found.lag_s else OFTEN_OFF, SAME, lag_s=found.lag_s)
+        self._off_looks = self._off_looks + 1 if lag.is_off else 0
+        if self.cause is None and (lag.lag_s or self._off_looks == OFF_LOOKS):
+            self._late = lag
+            late = f"they are {lag.lag_text}: they fit the turn of another moment"
+            cause = Cause(late if lag.lag_s else OFTEN_OFF, SAME, lag_s=lag.lag_s)
             self._begin(cause, stretch, self._history.from_ns, host_ns)
-        elif self._late is not None and found.fast_rad_s > MUCH_LESS * self._late.fast_rad_s:
+        elif self._late is not None and lag.fast_rad_s > MUCH_LESS * self._late.fast_rad_s:
             was = self._late.off_rad_s / self._late.fast_rad_s
-            fitting = not found.lag_s and found.off_rad_s < MUCH_LESS * was * found.fast_rad_s
+            fitting = not lag.lag_s and lag.off_rad_s < MUCH_LESS * was * lag.fast_rad_s
             self._no_more = self._no_more + 1 if fitting else 0
             if self._no_more == LATE_NO_MORE:
                 self._end("the packets' rates are those of their quaternions again")
 
     def _begin(self, cause: Cause, stretch: Stretch, from_ns: int, host_ns: int | None) -> None:
-        self.cause, self._was_off = cause, off_share(stretch)
+        self.cause = cause
+        self._was_off = off_share(stretch)
         self._no_more = self._off_looks = 0
-        since_ns = None if host_ns is None else host_ns - (stretch.to_ns - from_ns)
+        if host_ns is None:
+            since_ns = None
+        else:
+            since_ns = host_ns - (stretch.to_ns - from_ns)
         self._notices.begin(cause.kind, self._line(cause, stretch), since_ns)
 
     def _line(self, cause: Cause, stretch: Stretch) -> str:
-        turn_deg_s, rate_rad_s = (
-            np.degrees(np.linalg.norm(stretch.turn)),
-            np.linalg.norm(stretch.rate),
-        )
+        turn_deg_s = np.degrees(np.linalg.norm(stretch.turn))
+        rate_rad_s = np.linalg.norm(stretch.rate)
         if cause.reading is not None:
             return (
                 f"the packets' rates do not fit their quaternions as they are read; {cause.text}:"
                 f" the sky is drawn at another place; {cause.reading.advice} (both turn at"
                 f" {turn_deg_s:.3g} deg/s)"
             )
-        done = (
-            "the sky is drawn by the quaternions' own turn"
-            if self.distrusts
-            else "they are used all the same"
-        )
+        if self.distrusts:
+            done = "the sky is drawn by the quaternions' own turn"
+        else:
+            done = "they are used all the same"
         if not self._used:
             done = "nothing is drawn by them"
         return (
@@ -288,7 +293,9 @@ class RateCheck:
     def _end(self, why: str) -> None:
         self._restart()
         if self.cause is not None:
-            kind, self.cause, self._late = self.cause.kind, None, None
+            kind = self.cause.kind
+            self.cause = None
+            self._late = None
             self._notices.end(kind, ENDS[kind], why)
 
     def _restart(self) -> None:

@@ -43,11 +43,11 @@ class Resolution:
         if q != self._last:
             self._last = q
             for step in [*self._evidence]:
-                found = _evidence(q, step)
-                if found is None:
+                evidence = _evidence(q, step)
+                if evidence is None:
                     del self._evidence[step]
                 else:
-                    self._evidence[step] += found
+                    self._evidence[step] += evidence
         if not self._left or not self._evidence:
             self.decide()
 
@@ -55,7 +55,7 @@ class Resolution:
         """No more samples come: tell of their steps, where they show any."""
         self._left = 0
         # Thousandths are ten-thousandths, too: the coarsest that holds is the sender's.
-        steps = [step for step, found in self._evidence.items() if found >= MIN_EVIDENCE]
+        steps = [step for step, evidence in self._evidence.items() if evidence >= MIN_EVIDENCE]
         if not steps:
             return
         step = max(steps)
@@ -73,13 +73,13 @@ def coarse_lines(samples: Sequence[AttitudeSample]) -> list[tuple[str, str]]:
     """Kind and line of the notice where a log's quaternions are rounded coarsely; [] where they
     are not.
     """
-    told: list[tuple[str, str]] = []
-    resolution = Resolution(lambda kind, line: told.append((kind, line)))
+    notices: list[tuple[str, str]] = []
+    resolution = Resolution(lambda kind, line: notices.append((kind, line)))
     for sample in samples[:LOOKED_AT]:
         resolution.see(sample)
     if len(samples) < LOOKED_AT:
         resolution.decide()
-    return told[:1]
+    return notices[:1]
 
 
 def _evidence(q: list[float], step: float) -> int | None:
@@ -95,7 +95,9 @@ def _evidence(q: list[float], step: float) -> int | None:
         if abs(norm - 1) > min(2 * step, NORM_TOLERANCE):
             continue
         steps = [abs(part) * norm / step for part in q]
-        if all(abs(each - round(each)) < FIT for each in steps):
+        if all(abs(multiple - round(multiple)) < FIT for multiple in steps):
             exact = abs(norm - 1) < NOT_EXACT * step
-            return 0 if exact else len({round(each) for each in steps} - {0}) - 1
+            if exact:
+                return 0
+            return len({round(multiple) for multiple in steps} - {0}) - 1
     return None

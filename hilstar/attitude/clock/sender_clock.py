@@ -145,14 +145,18 @@ class OneWayFilter:
             return
         newest = self._slots[-1]
         x, y = self._slots.relative_to(newest)
-        drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else _supporting_slope(x, y)
+        if -x[0] < MIN_DRIFT_SPAN_NS:
+            drift = 0.0
+        else:
+            drift = _supporting_slope(x, y)
         above = y - drift * x
         level = float(above.min())
         above -= level
         # The line may lie below the truth by as much as a slot's smallest offset is above it. The
         # last slots count one by one and are carried on to the two for which the line is used: a
         # clock may be set by less than a jump, or drift unknown.
-        uncertainty_ns, last = math.inf, above[-RECENT_SLOTS:]
+        uncertainty_ns = math.inf
+        last = above[-RECENT_SLOTS:]
         if len(last) == RECENT_SLOTS:
             rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
             uncertainty_ns = float(max(np.median(above), last.max(), last[-1] + rise))
@@ -174,7 +178,8 @@ def _supporting_slope(x: FloatArray, y: FloatArray) -> float:
             hull.pop()
         hull.append(c)
     right = int(np.searchsorted(x[hull], x.mean()))
-    a, b = hull[max(right - 1, 0)], hull[max(right, 1)]
+    a = hull[max(right - 1, 0)]
+    b = hull[max(right, 1)]
     slope = float((y[b] - y[a]) / (x[b] - x[a]))
     return slope if abs(slope) <= MAX_DRIFT else 0.0
 
@@ -252,11 +257,11 @@ class _ExchangeFilter:
         self.line = self._fit(new)
 
     def _fit(self, new: _MeasuredExchange) -> _OffsetLine:
-        min_ns = min(each.delay_ns for each in self._measured)
+        min_ns = min(exchange.delay_ns for exchange in self._measured)
         limit_ns = max(min_ns * QUICK_DELAY_RATIO, min_ns + QUICK_DELAY_NS)
-        quick = [each for each in self._measured if each.delay_ns <= limit_ns]
-        x = np.array([each.host_ns - new.host_ns for each in quick], dtype=np.float64)
-        y = np.array([each.offset_ns - new.offset_ns for each in quick], dtype=np.float64)
+        quick = [exchange for exchange in self._measured if exchange.delay_ns <= limit_ns]
+        x = np.array([exchange.host_ns - new.host_ns for exchange in quick], dtype=np.float64)
+        y = np.array([exchange.offset_ns - new.offset_ns for exchange in quick], dtype=np.float64)
         drift = 0.0
         if np.ptp(x) >= MIN_DRIFT_SPAN_NS:
             drift = float(np.polyfit(x, y, 1)[0])
@@ -264,7 +269,9 @@ class _ExchangeFilter:
         level = float(np.mean(y - drift * x))
         # The truth lies within half the delay of each exchange's own offset, however the delay
         # divides between the two ways.
-        bounds = np.abs(y - drift * x - level) + 0.5 * np.array([each.delay_ns for each in quick])
+        bounds = np.abs(y - drift * x - level) + 0.5 * np.array(
+            [exchange.delay_ns for exchange in quick]
+        )
         uncertainty_ns = float(bounds[-RECENT_EXCHANGES:].max())
         if not drift and len(y) > 1:
             uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
@@ -371,7 +378,9 @@ class SenderClock:
 
         For one thread, with host times that do not go back.
         """
-        line, first_ns, base_ns = self._line, self._first_ns, self._base_ns
+        line = self._line
+        first_ns = self._first_ns
+        base_ns = self._base_ns
         if line is None or base_ns is None:
             return host_ns
         offset_ns = line.at(host_ns)
@@ -388,17 +397,19 @@ class SenderClock:
         """A message's delay: the whole of it where exchanges run, else its excess over the
         minimum; None before any.
         """
-        line, base_ns = self._line, self._base_ns
-        return (
-            None if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
-        )
+        line = self._line
+        base_ns = self._base_ns
+        if line is None or base_ns is None:
+            return None
+        return host_ns - t_ns - base_ns - line.at(host_ns)
 
     def late_ns(self, t_ns: int, host_ns: int) -> float:
         """A message's delay above the line of the arrivals alone; 0 before any message."""
-        line, base_ns = self._one_way.line, self._base_ns
-        return (
-            0.0 if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
-        )
+        line = self._one_way.line
+        base_ns = self._base_ns
+        if line is None or base_ns is None:
+            return 0.0
+        return host_ns - t_ns - base_ns - line.at(host_ns)
 
     @property
     def unheard(self) -> bool:
@@ -415,7 +426,10 @@ class SenderClock:
         line = self._line
         if line is None or self._base_ns is None:
             return ClockSummary(self.mode)
-        behind_ns = 0.0 if self._used is None else abs(line.at(self._used[0]) - self._used[1])
+        if self._used is None:
+            behind_ns = 0.0
+        else:
+            behind_ns = abs(line.at(self._used[0]) - self._used[1])
         uncertainty_ns = line.uncertainty_ns
         if self.mode == "one-way":
             uncertainty_ns = max(uncertainty_ns, self._one_way.all_above_ns) + LOCAL_DELAY_NS

@@ -129,23 +129,30 @@ class _Counter:
         """How far the time of a message that continues this counter is from its usual step, ns;
         None where it does not continue it.
         """
-        sample, period_ns = arrival.event, self.period_ns
-        later_ns, gap_ns = sample.t_ns - self.t_ns, arrival.host_ns - self.host_ns
+        sample = arrival.event
+        period_ns = self.period_ns
+        later_ns = sample.t_ns - self.t_ns
+        gap_ns = arrival.host_ns - self.host_ns
         step = self._advance(sample.sequence, later_ns, gap_ns)
         if step is None:
             return None
         if period_ns is None:
-            return math.inf if -EARLY_NS <= later_ns <= MAX_STEP_NS else None
+            if -EARLY_NS <= later_ns <= MAX_STEP_NS:
+                return math.inf
+            return None
         off_ns = abs(sample.t_ns - self.count_t_ns - step * period_ns)
         waited_ns = min(self.waited_ns, NS_PER_S)
         if -EARLY_NS <= later_ns <= max(gap_ns + EARLY_NS + waited_ns, 3 * period_ns):
             return off_ns
         # time and count may advance together, however late it is
-        return off_ns if step and off_ns <= (0.5 + 0.05 * step) * period_ns else None
+        if step and off_ns <= (0.5 + 0.05 * step) * period_ns:
+            return off_ns
+        return None
 
     def counts(self, arrival: SampleArrival) -> bool:
         """Whether a message goes on from the newest in its count, whatever its time."""
-        later_ns, gap_ns = arrival.event.t_ns - self.t_ns, arrival.host_ns - self.host_ns
+        later_ns = arrival.event.t_ns - self.t_ns
+        gap_ns = arrival.host_ns - self.host_ns
         return self._advance(arrival.event.sequence, later_ns, gap_ns) is not None
 
     def _advance(self, sequence: int, later_ns: int, gap_ns: int) -> int | None:
@@ -175,7 +182,9 @@ class _Counter:
             return None
         step = _steps(self.sequence, arrival.event.sequence)
         off_ns = abs(arrival.event.t_ns - self.count_t_ns - step * self.period_ns)
-        return off_ns if step > 0 and off_ns < AWAITED_SHARE * self.period_ns else None
+        if step > 0 and off_ns < AWAITED_SHARE * self.period_ns:
+            return off_ns
+        return None
 
     def has(self, sample: AttitudeSample) -> bool:
         """Whether this very message was taken before."""
@@ -201,8 +210,10 @@ class _Counter:
             self._count(sample)
         self.silence_ns = max(arrival.host_ns - self.host_ns, FORGETS * self.silence_ns)
         self.heard += 1
-        self.t_ns, self.raw = sample.t_ns, arrival.raw
-        self.host_ns, self.waited_ns = arrival.host_ns, arrival.waited_ns
+        self.t_ns = sample.t_ns
+        self.raw = arrival.raw
+        self.host_ns = arrival.host_ns
+        self.waited_ns = arrival.waited_ns
 
     def _count(self, sample: AttitudeSample) -> None:
         step = max(_steps(self.sequence, sample.sequence), 1)
@@ -215,7 +226,8 @@ class _Counter:
                 self.period_ns += (period_ns - self.period_ns) * PERIOD_GAIN
         self.even_share += ((step == self.step) - self.even_share) * EVEN_GAIN
         self.step = step
-        self.sequence, self.count_t_ns = sample.sequence, sample.t_ns
+        self.sequence = sample.sequence
+        self.count_t_ns = sample.t_ns
         self.taken[sample.sequence % RECENT] = _Taken(sample.sequence, sample.t_ns)
 
     def patience_ns(self, silent_after_ns: int) -> float:
@@ -231,7 +243,8 @@ class Repeats:
     """
 
     def __init__(self, notices: Notices, state: StreamState) -> None:
-        self._notices, self._state = notices, state
+        self._notices = notices
+        self._state = state
         self._count = 0
         self._frozen = False
 
@@ -242,7 +255,8 @@ class Repeats:
         self._count += 1
         if self._count >= MIN_REPEATS and arrival.host_ns - newest.host_ns >= MIN_REPEATED_NS:
             what = f"the sender's clock has stopped at t_ns {newest.t_ns}"
-            what = "the sender repeats one packet" if arrival.raw == newest.raw else what
+            if arrival.raw == newest.raw:
+                what = "the sender repeats one packet"
             self._frozen = True
             self._notices.begin(
                 FROZEN, f"{what}: refused (time), and the attitude shown is getting old"
@@ -283,7 +297,8 @@ class Senders:
 
     def __init__(self, silent_after_ns: int, notices: Notices, state: StreamState) -> None:
         self._silent_after_ns = silent_after_ns
-        self._notices, self._state = notices, state
+        self._notices = notices
+        self._state = state
         self._repeats = Repeats(notices, state)
         self._main: _Counter | None = None
         # of the sender shown
@@ -302,7 +317,8 @@ class Senders:
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
         """The messages that this one decides, in order; a refusal says which are not shown."""
-        main, sample = self._main, arrival.event
+        main = self._main
+        sample = arrival.event
         if main is None:
             return self._begin(arrival)
         if _identity(arrival) != self._identity:
@@ -344,8 +360,10 @@ class Senders:
         return [arrival]
 
     def _show(self, counter: _Counter) -> None:
-        self._main, counter.shown = counter, True
-        self._begun, self._irregular = 0, False
+        self._main = counter
+        counter.shown = True
+        self._begun = 0
+        self._irregular = False
         self._repeats.end()
 
     def _take_other(self, main: _Counter, arrival: SampleArrival) -> list[SampleArrival]:
@@ -353,7 +371,8 @@ class Senders:
         # one that was not read for a while was not silent
         silent_ns = arrival.host_ns - arrival.waited_ns - main.host_ns
         if silent_ns <= self._silent_after_ns:
-            self._other, self._other_ns = _identity(arrival), arrival.host_ns
+            self._other = _identity(arrival)
+            self._other_ns = arrival.host_ns
             return [_refused(arrival)]
         self._part("the first sender is silent; showing the other one")
         undecided = [_refused(held.arrival) for held in self._emptied()]
@@ -372,7 +391,8 @@ class Senders:
             if host_ns - self._other_ns >= OTHER_LIFE_NS:
                 self._other_ns = None
             elif not self._told:
-                shown, refused = _named(self._identity), _named(self._other)
+                shown = _named(self._identity)
+                refused = _named(self._other)
                 self._tell(f"showing {shown}, refusing {refused}")
         if self._told and not self._others and self._other_ns is None:
             self._part("the second sender is silent")
@@ -381,11 +401,16 @@ class Senders:
         """The other counter that a message continues. Where it continues the one shown, too, off
         its usual step by `off_ns`, only one that awaits it.
         """
-        nearest, both = None, off_ns is not None
+        nearest = None
+        both = off_ns is not None
         for other in self._others:
-            other_off_ns = other.awaited_off_ns(arrival) if both else other.off_ns(arrival)
+            if both:
+                other_off_ns = other.awaited_off_ns(arrival)
+            else:
+                other_off_ns = other.off_ns(arrival)
             if other_off_ns is not None and (off_ns is None or other_off_ns < off_ns):
-                nearest, off_ns = other, other_off_ns
+                nearest = other
+                off_ns = other_off_ns
         return nearest
 
     def _speaks(self, main: _Counter, arrival: SampleArrival) -> list[SampleArrival]:
@@ -401,7 +426,9 @@ class Senders:
         if any(held.counter.heard >= MIN_RUN for held in self._held if held.counter is not main):
             self._two = True
             self._tell("showing the first, refusing the other")
-        return self._decided(main) if self._two or main.established else []
+        if self._two or main.established:
+            return self._decided(main)
+        return []
 
     def _moves(self, main: _Counter, arrival: SampleArrival) -> None:
         main.move(arrival)
@@ -499,7 +526,8 @@ class Senders:
         return self._decided(counter)
 
     def _emptied(self) -> list[_Held]:
-        held, self._held = self._held, []
+        held = self._held
+        self._held = []
         return held
 
     def _tell(self, which: str) -> None:

@@ -58,7 +58,8 @@ class Stages:
     """
 
     def __init__(self, stages: Sequence[Stage], settle: Callable[[SampleArrival], None]) -> None:
-        self._stages, self._settle = stages, settle
+        self._stages = stages
+        self._settle = settle
 
     def take(self, arrival: SampleArrival) -> None:
         """Take the next message."""

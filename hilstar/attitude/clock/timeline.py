@@ -58,7 +58,10 @@ class _Damped(NamedTuple):
 
     def by(self, seconds: float) -> Vector:
         # 1 - sin(x) / x goes with the square
-        share = 1.0 if seconds >= self.ahead_s else (seconds / self.ahead_s) ** 2
+        if seconds >= self.ahead_s:
+            share = 1.0
+        else:
+            share = (seconds / self.ahead_s) ** 2
         x, y, z = self.excess
         return share * x, share * y, share * z
 
@@ -85,7 +88,8 @@ class _Damping:
         self._trend = [0.0, 0.0, 0.0]
         self._weight = 0.0
         self._ahead_s = 0.0
-        self._xx, self._xy = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self._xx = [0.0, 0.0, 0.0]
+        self._xy = [0.0, 0.0, 0.0]
 
     def asked(self, seconds: float) -> None:
         self.usual_s += AGE_SHARE * (seconds - self.usual_s)
@@ -104,8 +108,11 @@ class _Damping:
         last = self._seen[-1]
         step_s = (t_ns - last.t_ns) / NS_PER_S
         keeps = math.exp(-step_s / STEADY_S)
-        alpha, beta = 1 - keeps * keeps, (1 - keeps) ** 2
-        steady, turned, jitter = list(last.steady), list(last.turned), [0.0, 0.0, 0.0]
+        alpha = 1 - keeps * keeps
+        beta = (1 - keeps) ** 2
+        steady = list(last.steady)
+        turned = list(last.turned)
+        jitter = [0.0, 0.0, 0.0]
         for axis in range(3):
             expected = steady[axis] + self._trend[axis] * step_s
             off = rate[axis] - expected
@@ -133,7 +140,9 @@ class _Damping:
                 goes_on = min(max(self._xy[axis] / self._xx[axis], 0.0), 1.0)
                 excess[axis] = (1.0 - goes_on) * min(max(jitter[axis], -most), most)
         self._seen.append(_SeenSample(t_ns, tuple(turned), tuple(steady), tuple(jitter)))
-        return UNDAMPED if len(self._seen) <= MIN_SAMPLES else _Damped(tuple(excess), self._ahead_s)
+        if len(self._seen) <= MIN_SAMPLES:
+            return UNDAMPED
+        return _Damped(tuple(excess), self._ahead_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +218,8 @@ class Timeline:
                 )
             self._t_ns.append(sample.t_ns)
             self._samples.append(sample)
-            self._received_ns, self._damped = received_ns, damped
+            self._received_ns = received_ns
+            self._damped = damped
             if len(self._samples) > 2 * self._capacity:
                 del self._t_ns[: self._capacity], self._samples[: self._capacity]
             return None
@@ -229,15 +239,17 @@ class Timeline:
                 return None
             i = bisect_right(self._t_ns, t_ns) - 1
             near = self._samples[max(i - 1, 0) : i + 3]
-            received_ns, damped = self._received_ns, self._damped
+            received_ns = self._received_ns
+            damped = self._damped
         place = max(min(i, 1), 0)
-        found = (
-            self._at(t_ns, near, place, received_ns, damped) if i >= 0 else _held(near[0], 0, False)
-        )
+        if i >= 0:
+            state = self._at(t_ns, near, place, received_ns, damped)
+        else:
+            state = _held(near[0], 0, False)
         if near[place].velocity_km_s is None:
-            return found
+            return state
         return replace(
-            found,
+            state,
             velocity_km_s=near[place].velocity_km_s,
             place_km=self._place_km(near, place, t_ns),
         )
@@ -250,7 +262,10 @@ class Timeline:
         if before.place_km is None or before.velocity_km_s is None:
             return None
         age_ns = max(t_ns - before.t_ns, 0)
-        after = near[place + 1] if place + 1 < len(near) else before
+        if place + 1 < len(near):
+            after = near[place + 1]
+        else:
+            after = before
         if (
             after is before
             or after.place_km is None
@@ -287,20 +302,23 @@ class Timeline:
                 return _held(newest, age_ns, gap)
             q, rate = self._between(near, place, age_ns, join)
             return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
-        own = self._rate_of(near[place - 1] if place else None, newest)
-        return replace(self._predict(newest, own, age_ns, damped), received_ns=received_ns)
+        own_rate = self._rate_of(near[place - 1] if place else None, newest)
+        return replace(self._predict(newest, own_rate, age_ns, damped), received_ns=received_ns)
 
     def _between(
         self, near: list[AttitudeSample], place: int, age_ns: int, join: Join
     ) -> tuple[FloatArray, FloatArray]:
         """Attitude and rate between two samples; in a blend the rates are blended too."""
-        before, after = near[place], near[place + 1]
+        before = near[place]
+        after = near[place + 1]
         gap_ns = after.t_ns - before.t_ns
-        rate, rate_after = before.rate_cam_rad_s, after.rate_cam_rad_s
+        rate = before.rate_cam_rad_s
+        rate_after = after.rate_cam_rad_s
         if rate is None or rate_after is None or join == "slerp":
             rate = rate_between_rad_s(before.q_icrs_to_cam, after.q_icrs_to_cam, gap_ns / NS_PER_S)
             return slerp(before.q_icrs_to_cam, after.q_icrs_to_cam, age_ns / gap_ns), rate
-        forward, backward = age_ns / NS_PER_S, (age_ns - gap_ns) / NS_PER_S
+        forward = age_ns / NS_PER_S
+        backward = (age_ns - gap_ns) / NS_PER_S
         bend, bend_after = (self._acceleration_rad_s2(near, k) for k in (place, place + 1))
         from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
         from_after = propagate(
@@ -318,9 +336,16 @@ class Timeline:
         """At sample `k`, from its neighbours' rates: equal for the intervals on both sides,
         which makes the blend C2.
         """
-        earlier = k - 1 if k and self._joined(near[k - 1], near[k]) == "blend" else k
-        later = k + 1 if k + 1 < len(near) and self._joined(near[k], near[k + 1]) == "blend" else k
-        rate, rate_later = near[earlier].rate_cam_rad_s, near[later].rate_cam_rad_s
+        if k and self._joined(near[k - 1], near[k]) == "blend":
+            earlier = k - 1
+        else:
+            earlier = k
+        if k + 1 < len(near) and self._joined(near[k], near[k + 1]) == "blend":
+            later = k + 1
+        else:
+            later = k
+        rate = near[earlier].rate_cam_rad_s
+        rate_later = near[later].rate_cam_rad_s
         if rate is None or rate_later is None or earlier == later:
             raise AssertionError("a sample of a blend has a rate and a neighbour")
         return (rate_later - rate) / ((near[later].t_ns - near[earlier].t_ns) / NS_PER_S)
@@ -333,9 +358,9 @@ class Timeline:
         # Rates say little about a long silence: propagated across it from both sides they
         # overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
-        return (
-            "blend" if known and after.t_ns - before.t_ns <= self.policy.stale_after_ns else "slerp"
-        )
+        if known and after.t_ns - before.t_ns <= self.policy.stale_after_ns:
+            return "blend"
+        return "slerp"
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         """True where the attitude jumps: the sample says so, or the turn would exceed the
@@ -366,7 +391,8 @@ class Timeline:
         """What a prediction takes from the rate of the next sample; nothing from one whose
         acceleration is known.
         """
-        damping, previous = self._damping, self._samples[-1] if self._samples else None
+        damping = self._damping
+        previous = self._samples[-1] if self._samples else None
         if damping is None or (previous is not None and sample.t_ns <= previous.t_ns):
             return UNDAMPED
         rate = self._rate_of(previous, sample)
@@ -391,7 +417,8 @@ class Timeline:
         # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17,
         # holding 144.
         prediction_ns = min(age_ns, self.policy.max_extrapolation_ns)
-        seconds, bend = prediction_ns / NS_PER_S, newest.acceleration_cam_rad_s2
+        seconds = prediction_ns / NS_PER_S
+        bend = newest.acceleration_cam_rad_s2
         if self._damping is not None:
             self._damping.asked(seconds)
             if damped is not UNDAMPED:

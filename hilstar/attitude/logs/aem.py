@@ -109,7 +109,8 @@ def _euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatA
 
     `values` (n, 3 or 6) are degrees and degrees per second.
     """
-    axes, values = ccsds.sequence(meta), np.radians(values)
+    axes = ccsds.sequence(meta)
+    values = np.radians(values)
     q = _turned(values[:, :3], axes)
     if meta["ATTITUDE_TYPE"] != ccsds.EULER_DERIVATIVE:
         return q, None
@@ -133,7 +134,8 @@ def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
     rate = np.zeros((len(values), 3))
     rate[:, 2] = spin_rate
     if kind == ccsds.SPIN_NUTATION:
-        nutation, phase = np.radians(values[:, 4]), np.radians(values[:, 6])
+        nutation = np.radians(values[:, 4])
+        phase = np.radians(values[:, 6])
         momentum = np.stack(
             (np.sin(nutation) * np.cos(phase), -np.sin(nutation) * np.sin(phase), np.cos(nutation)),
             axis=1,
@@ -178,23 +180,26 @@ class _DatedBlock:
         attitude = self._timeline.at(t_ns)
         if attitude is None or not isinstance(before, AttitudeSample):
             raise AssertionError("a whole segment has attitudes")
-        rate = None if before.rate_cam_rad_s is None else attitude.rate_cam_rad_s
+        if before.rate_cam_rad_s is None:
+            rate = None
+        else:
+            rate = attitude.rate_cam_rad_s
         return LogEntry(where, AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate))
 
     def useable_ns(self) -> tuple[int, int]:
         """Where it is meant to be used; without keywords, all of it. Raises AemFaultError."""
-        where, meta = self.block.where[0], self.block.meta
-        first, last = self.times[0], self.times[-1]
-        start = (
-            ccsds.epoch_ns(where, meta["USEABLE_START_TIME"])
-            if "USEABLE_START_TIME" in meta
-            else first
-        )
-        stop = (
-            ccsds.epoch_ns(where, meta["USEABLE_STOP_TIME"])
-            if "USEABLE_STOP_TIME" in meta
-            else last
-        )
+        where = self.block.where[0]
+        meta = self.block.meta
+        first = self.times[0]
+        last = self.times[-1]
+        if "USEABLE_START_TIME" in meta:
+            start = ccsds.epoch_ns(where, meta["USEABLE_START_TIME"])
+        else:
+            start = first
+        if "USEABLE_STOP_TIME" in meta:
+            stop = ccsds.epoch_ns(where, meta["USEABLE_STOP_TIME"])
+        else:
+            stop = last
         if stop < start:
             raise ccsds.AemFaultError(where, "USEABLE_STOP_TIME is before USEABLE_START_TIME")
         return min(max(start, first), last), max(min(stop, last), first)
@@ -210,7 +215,7 @@ def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[Lo
         if (
             groups
             and segment.times[0] < end_ns
-            and all(each.is_whole for each in (segment, *groups[-1]))
+            and all(block.is_whole for block in (segment, *groups[-1]))
         ):
             groups[-1].append(segment)
             end_ns = max(end_ns, segment.times[-1])
@@ -271,14 +276,14 @@ def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
     piece = segment.entries[
         bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)
     ]
-    own = {
+    own_samples = {
         entry.event.t_ns
         for entry in piece[:1] + piece[-1:]
         if isinstance(entry.event, AttitudeSample)
     }
-    if start_ns not in own:
+    if start_ns not in own_samples:
         piece.insert(0, segment.at(start_ns))
-    if stop_ns not in own and stop_ns > start_ns:
+    if stop_ns not in own_samples and stop_ns > start_ns:
         piece.append(segment.at(stop_ns))
     return piece
 
@@ -295,7 +300,10 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
     and one of those above.
     """
     is_xml = text.lstrip().startswith("<")
-    blocks = ccsds.xml_blocks(text) if is_xml else ccsds.kvn_blocks(text)
+    if is_xml:
+        blocks = ccsds.xml_blocks(text)
+    else:
+        blocks = ccsds.kvn_blocks(text)
     return read_blocks(blocks, of_date)
 
 
@@ -312,19 +320,27 @@ def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
         raise ccsds.AemFaultError(
             "", "the spacecraft's frame changes from block to block; write one file for each"
         )
-    timed = [
-        ([ccsds.epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b)
-        for b in blocks
-    ]
+    timed = []
+    for b in blocks:
+        timed.append(
+            (
+                [
+                    ccsds.epoch_ns(where, epoch)
+                    for where, epoch in zip(b.where, b.epochs, strict=True)
+                ],
+                b,
+            )
+        )
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[LogEntry] = []
-    told: dict[str, str] = {}
+    notices: dict[str, str] = {}
     segments = [
-        _DatedBlock(block, times, list(_entries(block, times, of_date, told)))
+        _DatedBlock(block, times, list(_entries(block, times, of_date, notices)))
         for times, block in timed
     ]
-    for following in _resolved(segments, told):
-        first, end = following[0], entries[-1] if entries else None
+    for following in _resolved(segments, notices):
+        first = following[0]
+        end = entries[-1] if entries else None
         if (
             end is not None
             and isinstance(end.event, AttitudeSample)
@@ -336,9 +352,11 @@ def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
             following[0] = LogEntry(first.where, replace(first.event, discontinuity=True))
         entries += following
     if any(block.meta["ATTITUDE_TYPE"] == ccsds.EULER_RATE for block in blocks):
-        told["aem-rates"] = AMBIGUOUS
+        notices["aem-rates"] = AMBIGUOUS
     (first_ns, *_), block = timed[0]
-    return LogReading(entries, _conventions(block, first_ns, of_date), ADVICE, list(told.items()))
+    return LogReading(
+        entries, _conventions(block, first_ns, of_date), ADVICE, list(notices.items())
+    )
 
 
 def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventions:
@@ -361,12 +379,18 @@ def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventi
             q = multiply(
                 q, conjugate(of_date(reference, scale, np.array([first_ns], dtype=np.int64))[0][0])
             )
-        own = conjugate(q) if to_body else q
+        own_q = conjugate(q) if to_body else q
         when = "" if inertial else f" at {block.epochs[0]}"
-        return f"{names} = {components(own if scalar_first else np.roll(own, -1))}{when}"
+        return f"{names} = {components(own_q if scalar_first else np.roll(own_q, -1))}{when}"
 
-    turned = "" if inertial else f" ({reference} by hilstar: the ICRF, at each epoch)"
-    leap = "; leap seconds are not counted" if scale == "UTC" else ""
+    if inertial:
+        turned = ""
+    else:
+        turned = f" ({reference} by hilstar: the ICRF, at each epoch)"
+    if scale == "UTC":
+        leap = "; leap seconds are not counted"
+    else:
+        leap = ""
     return Conventions(
         "CCSDS AEM",
         f"{meta['ATTITUDE_TYPE']} turns components of {first} into those of {second}{turned}",
@@ -418,7 +442,8 @@ def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
     """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components,
     rad/s.
     """
-    meta, kind = block.meta, block.meta["ATTITUDE_TYPE"]
+    meta = block.meta
+    kind = block.meta["ATTITUDE_TYPE"]
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
         if kind not in ccsds.QUATERNIONS:
@@ -428,12 +453,11 @@ def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
             if kind == ccsds.EULER_ANGVEL:
                 q = q if to_cam else conjugate(q)
                 return q, _rate_in_cam(meta, q, np.radians(block.values[:, 3:]))
-            return (
-                (q, rate)
-                if to_cam
-                else (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
-            )
-        q, more = block.values[:, :4], block.values[:, 4:]
+            if to_cam:
+                return (q, rate)
+            return (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
+        q = block.values[:, :4]
+        more = block.values[:, 4:]
         if to_cam:
             q = conjugate(q)
         if kind == ccsds.QUATERNION:
@@ -467,7 +491,8 @@ def _rate_in_cam(meta: dict[str, str], q: FloatArray, rate: FloatArray) -> Float
 
 def _frames(meta: dict[str, str]) -> tuple[str, str]:
     """The frame among the stars (or of a date), and the spacecraft's. Raises AemFaultError."""
-    a, b = meta["REF_FRAME_A"], meta["REF_FRAME_B"]
+    a = meta["REF_FRAME_A"]
+    b = meta["REF_FRAME_B"]
     reference, body = (a, b) if _is_reference(a) else (b, a)
     if not _is_reference(reference) or not BODY_FRAME.fullmatch(body):
         wanted = "one must be ICRF, EME2000, MOD, TOD, TEME or ITRF"
@@ -518,7 +543,9 @@ def _time_system(samples: Sequence[AttitudeSample], scale: str | None) -> str:
     """
     if scale in SCALES:
         return str(scale)
-    return "UTC" if samples[0].t_ns >= FIRST_DATE_NS else "SCLK"
+    if samples[0].t_ns >= FIRST_DATE_NS:
+        return "UTC"
+    return "SCLK"
 
 
 def _written_block(samples: Sequence[AttitudeSample], scale: str) -> ccsds.Block:
@@ -573,11 +600,10 @@ def _xml(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
             *(f"        <COMMENT>{line}</COMMENT>" for line in COMMENTS),
         )
         yield from (*_elements(8, segment.meta), "      </metadata>", "      <data>")
-        name = (
-            "quaternionState"
-            if segment.meta["ATTITUDE_TYPE"] == ccsds.QUATERNION
-            else "quaternionDerivative"
-        )
+        if segment.meta["ATTITUDE_TYPE"] == ccsds.QUATERNION:
+            name = "quaternionState"
+        else:
+            name = "quaternionDerivative"
         for epoch, values in zip(segment.epochs, segment.values.tolist(), strict=True):
             yield from (
                 "        <attitudeState>",

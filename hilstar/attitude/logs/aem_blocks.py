@@ -170,9 +170,10 @@ def _fault_of(key: str, section: str, version: str) -> str | None:
     if key in SECTIONS[other]:
         return f"{key} is in the {section}; it belongs in the {other}"
     near = difflib.get_close_matches(key.upper()[:40], SECTIONS[section], n=1)
-    advice = (
-        f"did you mean {near[0]}?" if near else f"the keywords are {', '.join(SECTIONS[section])}"
-    )
+    if near:
+        advice = f"did you mean {near[0]}?"
+    else:
+        advice = f"the keywords are {', '.join(SECTIONS[section])}"
     return f"{key[:40]} is not a keyword of an AEM's {section}; {advice}"
 
 
@@ -244,12 +245,15 @@ def _day(text: str) -> int | None:
     """Days from 1970-01-01 to YYYY-MM-DD or YYYY-DDD, or None when the calendar has no such day."""
     year, first, *second = map(int, text.split("-"))
     try:
-        day = (
-            date(year, first, second[0]) if second else date(year, 1, 1) + timedelta(days=first - 1)
-        )
+        if second:
+            day = date(year, first, second[0])
+        else:
+            day = date(year, 1, 1) + timedelta(days=first - 1)
     except (ValueError, OverflowError):
         return None
-    return day.toordinal() - UNIX_DAY if day.year == year else None
+    if day.year == year:
+        return day.toordinal() - UNIX_DAY
+    return None
 
 
 def epoch_text(t_ns: int) -> str:
@@ -266,7 +270,8 @@ def kvn_blocks(text: str) -> list[Block]:
     meta: dict[str, str] = {}
     rows: list[tuple[str, list[str]]] = []
     blocks: list[Block] = []
-    section, number = "header", 0
+    section = "header"
+    number = 0
     for number, line in enumerate(map(str.strip, io.StringIO(text, newline=None)), start=1):
         where = f":{number}"
         if not line or line.split(maxsplit=1)[0] == "COMMENT":
@@ -280,7 +285,8 @@ def kvn_blocks(text: str) -> list[Block]:
                 )
             section = MARKERS[line][1]
             if line == "META_START":
-                meta, rows = dict(header), []
+                meta = dict(header)
+                rows = []
             elif line == "DATA_STOP":
                 blocks.append(_kvn_block(meta, rows, where))
         elif section == "data":
@@ -326,20 +332,20 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
             where, f"QUATERNION_TYPE is {order}; write FIRST or LAST, where the scalar is"
         )
     values = []
-    for place, words in rows:
+    for place, fields in rows:
         try:
-            if len(words) != count:
+            if len(fields) != count:
                 raise ValueError
-            values.append([float(word) for word in words[1:]])
+            values.append([float(word) for word in fields[1:]])
         except ValueError:
             wanted = f"write an epoch and {count - 1} numbers for {meta['ATTITUDE_TYPE']}"
-            raise AemFaultError(place, f"{' '.join(words)[:80]!r}; {wanted}") from None
+            raise AemFaultError(place, f"{' '.join(fields)[:80]!r}; {wanted}") from None
     table = np.array(values, dtype=np.float64)
     if has_quaternion and order == "LAST":
         table[:, :4] = table[:, [3, 0, 1, 2]]
         if meta["ATTITUDE_TYPE"] == DERIVATIVE:
             table[:, 4:] = table[:, [7, 4, 5, 6]]
-    return Block(meta, [place for place, _ in rows], [words[0] for _, words in rows], table)
+    return Block(meta, [place for place, _ in rows], [fields[0] for _, fields in rows], table)
 
 
 @dataclass(slots=True)
@@ -395,12 +401,12 @@ def xml_blocks(text: str) -> list[Block]:
         raise AemFaultError("", f"the <ndm> contains {reading.messages} <aem>; write one")
     return [
         Block(
-            each.meta,
-            [f", {epoch[:40]}" for epoch in each.epochs],
-            each.epochs,
-            np.array(each.rows, dtype=np.float64),
+            segment.meta,
+            [f", {epoch[:40]}" for epoch in segment.epochs],
+            segment.epochs,
+            np.array(segment.rows, dtype=np.float64),
         )
-        for each in reading.segments
+        for segment in reading.segments
     ]
 
 
@@ -564,16 +570,17 @@ def _key(path: str, leaf: _Element, wanted: list[str], meta: dict[str, str]) -> 
         return path
     container = path.partition("/")[0]
     if container == "rotationAngles":
-        axis, place = leaf.attributes.get("angle", "missing").upper(), int(leaf.name[-1]) - 1
+        axis = leaf.attributes.get("angle", "missing").upper()
+        place = int(leaf.name[-1]) - 1
         needed = "XYZ"[sequence(meta)[place]] + "_ANGLE"
         if axis != needed:
             raise leaf.unlike(
                 f"{leaf.name} is the {axis[:40]}, and EULER_ROT_SEQ has {needed} there"
             )
         return path
-    return (
-        path if path in wanted else f"{container}/{leaf.attributes.get('rate', 'missing').upper()}"
-    )
+    if path in wanted:
+        return path
+    return f"{container}/{leaf.attributes.get('rate', 'missing').upper()}"
 
 
 def _number(leaf: _Element, key: str) -> float:
@@ -599,8 +606,6 @@ def _unit(key: str) -> str:
         return "1/s"
     if name == "NUTATION_PER":
         return "s"
-    return (
-        "deg/s"
-        if container == "rotationRates" or name.endswith(("_VEL", "_DOT")) or "ANGVEL" in name
-        else "deg"
-    )
+    if container == "rotationRates" or name.endswith(("_VEL", "_DOT")) or "ANGVEL" in name:
+        return "deg/s"
+    return "deg"

@@ -69,16 +69,16 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
     from hilstar.attitude.logs.earth import q_icrs_to_date  # 30 ms
 
     text = read_text(path, "write a shorter file", MAX_BYTES)
-    told: list[tuple[str, str]] = []
+    notices: list[tuple[str, str]] = []
     with faults_named(path):
-        blocks = [_block(segment, told) for segment in _segments(text)]
+        blocks = [_block(segment, notices) for segment in _segments(text)]
         reading = read_blocks(blocks, q_icrs_to_date)
     conventions = replace(
         reading.conventions,
         source="CIC AEM (CNES, VTS)",
         scalar="scalar first (q0, q1, q2, q3), the conjugate of a Hamilton quaternion",
     )
-    yield replace(reading, conventions=conventions, told=[*told, *reading.told])
+    yield replace(reading, conventions=conventions, told=[*notices, *reading.told])
 
 
 class _CicReading:
@@ -124,7 +124,8 @@ class _CicReading:
 
 def _segments(text: str) -> list[_CicSegment]:
     """The segments of a file. Raises AemFaultError."""
-    reading, number = _CicReading(), 0
+    reading = _CicReading()
+    number = 0
     for number, raw in enumerate(io.StringIO(text, newline=None), start=1):
         line = raw.strip()
         if line:
@@ -169,7 +170,10 @@ def _add_row(segment: _CicSegment, where: str, words: list[str]) -> None:
     if len(words) != times + 4:
         raise AemFaultError(where, f"{quoted!r} has {len(words)} numbers; {FORM}")
     try:
-        epoch = words[0] if times == 1 else _epoch(where, *words[:2])
+        if times == 1:
+            epoch = words[0]
+        else:
+            epoch = _epoch(where, *words[:2])
         numbers = [float(word) for word in words[times:]]
     except (ValueError, ArithmeticError):
         raise AemFaultError(where, f"{quoted!r}; {FORM}") from None
@@ -195,7 +199,8 @@ def _epoch(where: str, day_text: str, seconds_text: str) -> str:
 
 def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
     """The segment as a block of an AEM 1.0 whose scalar is first. Raises AemFaultError."""
-    meta, end = dict(segment.meta), segment.lines.get("ATTITUDE_TYPE", "")
+    meta = dict(segment.meta)
+    end = segment.lines.get("ATTITUDE_TYPE", "")
     for key in ("REF_FRAME_A", "REF_FRAME_B", "ATTITUDE_DIR", "TIME_SYSTEM", "ATTITUDE_TYPE"):
         if key not in meta:
             raise AemFaultError(end, f"{key} is missing in the metadata")
@@ -220,7 +225,8 @@ def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
 
 def _order(segment: _CicSegment) -> str:
     """Where the real part is: FIRST or LAST. Raises AemFaultError where that is open."""
-    stated, named = segment.meta.get("QUATERNION_TYPE", ""), segment.named_order
+    stated = segment.meta.get("QUATERNION_TYPE", "")
+    named = segment.named_order
     if stated in ("", FIRST) and named != LAST:
         return FIRST
     where = segment.lines.get("QUATERNION_TYPE", "")

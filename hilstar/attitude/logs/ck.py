@@ -73,7 +73,10 @@ def _beside_line(kernels: list[Path]) -> str:
     last_of_kind = {kernel.suffix.lower(): kernel.name for kernel in kernels}
     kinds = [kernel.suffix.lower() for kernel in kernels]
     counting = [last_of_kind[kind] for kind in BESIDE if kinds.count(kind) > 1]
-    of_several = f"; where they differ, the last counts ({', '.join(counting)})" if counting else ""
+    if counting:
+        of_several = f"; where they differ, the last counts ({', '.join(counting)})"
+    else:
+        of_several = ""
     return f"kernels from beside the CK: {names}{of_several}; --kernel names others"
 
 
@@ -90,14 +93,15 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
     Raises InputError for a file that is damaged, a kernel that is missing and a choice that is
     open.
     """
-    kernels, told = list(stated.kernels), []
+    kernels = list(stated.kernels)
+    notices = []
     if not kernels:
         kernels = _kernels_beside(path)
-        told.append(("kernels", _beside_line(kernels)))
+        notices.append(("kernels", _beside_line(kernels)))
     arrays, said = _asked(path, kernels, stated.body)
     if said["step_s"] is not None:
         error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"
-        told.append(
+        notices.append(
             (
                 "ck-step",
                 (
@@ -108,8 +112,11 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
         )
     gaps_s = said["gaps_s"]
     if gaps_s:
-        count = "1 gap" if len(gaps_s) == 1 else f"{len(gaps_s)} gaps"
-        told.append(
+        if len(gaps_s) == 1:
+            count = "1 gap"
+        else:
+            count = f"{len(gaps_s)} gaps"
+        notices.append(
             (
                 "log-gap",
                 f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there",
@@ -126,7 +133,7 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
         )
         for has_rate, (t_ns, q, rate, breaks, tick) in zip(known, rows, strict=True)
     )
-    return LogReading(entries, _conventions(said), "give a CK whose times differ", told)
+    return LogReading(entries, _conventions(said), "give a CK whose times differ", notices)
 
 
 def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, dict[str, Any]]:
@@ -155,10 +162,10 @@ def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, d
         )
     with np.load(io.BytesIO(done.stdout)) as archive:
         arrays = dict(archive)
-    said = json.loads(str(arrays.pop("said")))
-    if "error" in said:
-        raise InputError(said["error"])
-    return arrays, said
+    answer = json.loads(str(arrays.pop("said")))
+    if "error" in answer:
+        raise InputError(answer["error"])
+    return arrays, answer
 
 
 def _conventions(said: dict[str, Any]) -> Conventions:

@@ -149,7 +149,8 @@ def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
     segments = []
     for number, (ticks, integers) in enumerate(_summaries(spice, path, handle), start=1):
         body, reference, kind, has_rate, first_word, last_word = integers
-        start, stop = float(ticks[0]), float(ticks[1])
+        start = float(ticks[0])
+        stop = float(ticks[1])
         if not (math.isfinite(start) and math.isfinite(stop) and 0 <= start <= stop):
             raise InputError(
                 f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file"
@@ -206,7 +207,8 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
     # SPICE searches by a directory: the hundredth time (type 3), or the mean of it and the next
     # (type 1).
     directory = words[(packet_words + 1) * count :][: (count - 1) // DIRECTORY]
-    hundredth, following = epochs[DIRECTORY - 1 : -1 : DIRECTORY], epochs[DIRECTORY::DIRECTORY]
+    hundredth = epochs[DIRECTORY - 1 : -1 : DIRECTORY]
+    following = epochs[DIRECTORY::DIRECTORY]
     if not ((hundredth <= directory) & (directory <= following)).all():
         raise InputError(f"{where}: its directory is not that of its times; is the file damaged?")
     return epochs
@@ -237,7 +239,10 @@ def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Cove
     for segment, own_epochs, own_intervals in zip(segments, epochs, intervals, strict=True):
         # SPICE counts each instance of type 1 as an interval of its own; hilstar goes on from one
         # to the next.
-        spans = own_epochs[[0, -1]].reshape(1, 2) if segment.kind == 1 else own_intervals
+        if segment.kind == 1:
+            spans = own_epochs[[0, -1]].reshape(1, 2)
+        else:
+            spans = own_intervals
         if not np.isfinite(spans).all() or (np.diff(spans.ravel()) < 0).any():
             raise InputError(
                 f"{path}: segment {segment.number}: its intervals do not increase; is the file"
@@ -308,10 +313,9 @@ class _Piece:
         ):
             return ticks
         parts = np.ceil(spacing / longest).astype(int).tolist()
-        inner = [
-            np.linspace(a, b, n, endpoint=False)
-            for a, b, n in zip(ticks[:-1], ticks[1:], parts, strict=True)
-        ]
+        inner = []
+        for a, b, n in zip(ticks[:-1], ticks[1:], parts, strict=True):
+            inner.append(np.linspace(a, b, n, endpoint=False))
         return np.concatenate([*inner, ticks[-1:]])
 
 
@@ -346,7 +350,7 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
     for k in np.flatnonzero(owner_of_point >= 0).tolist():
         if owner_of_cell[k] < 0 and (k == 0 or owner_of_cell[k - 1] < 0):
             spans.append((owner_of_point[k], k, k))
-    found = []
+    pieces = []
     for owner, first, last in spans:
         (segment, epochs, *_), start, stop = (
             owners[owner],
@@ -356,8 +360,8 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
         within = slice(
             int(np.searchsorted(epochs, start, "right")), int(np.searchsorted(epochs, stop, "left"))
         )
-        found.append(_Piece(segment, start, stop, epochs[within]))
-    return sorted(found, key=lambda piece: piece.start)
+        pieces.append(_Piece(segment, start, stop, epochs[within]))
+    return sorted(pieces, key=lambda piece: piece.start)
 
 
 @dataclass(frozen=True)
@@ -390,8 +394,8 @@ class _Structure:
         """The C-matrix (3, 3), which turns ICRS components into the structure's. Raises
         InputError where there is none.
         """
-        matrix, _, found = self.spice.ckgp(self.body, tick, 0, FRAME)
-        if not found:
+        matrix, _, is_there = self.spice.ckgp(self.body, tick, 0, FRAME)
+        if not is_there:
             raise InputError(
                 f"{self.path}: SPICE has no attitude of {self.body} at tick {tick:.17g}, which its"
                 " segments cover"
@@ -410,8 +414,10 @@ class _Structure:
         """
         if not with_rate:
             return self.q_icrs_to_body(tick), None
-        matrix, rate, _, found = self.spice.ckgpav(self.body, tick, 0, FRAME)
-        if not (found and (self.turning or np.abs(matrix - self.matrix(tick)).max() < SAME_MATRIX)):
+        matrix, rate, _, is_there = self.spice.ckgpav(self.body, tick, 0, FRAME)
+        if not (
+            is_there and (self.turning or np.abs(matrix - self.matrix(tick)).max() < SAME_MATRIX)
+        ):
             return self.q_icrs_to_body(tick), None
         return from_matrix(matrix), matrix @ np.asarray(rate, dtype=np.float64)
 
@@ -475,11 +481,12 @@ def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
             " (ckslicer)"
         )
     broken, gaps_s = _parted(structure, pieces, ticks)
-    step_s = (
-        structure.t_s(smooth[0].start + step) - structure.t_s(smooth[0].start) if smooth else None
-    )
+    if smooth:
+        step_s = structure.t_s(smooth[0].start + step) - structure.t_s(smooth[0].start)
+    else:
+        step_s = None
     parts = [_attitudes(structure, *pair) for pair in zip(pieces, ticks, strict=True)]
-    t_ns, q, rate = (np.concatenate(each) for each in zip(*parts, strict=True))
+    t_ns, q, rate = (np.concatenate(column) for column in zip(*parts, strict=True))
     breaks = np.zeros(len(t_ns), dtype=np.bool_)
     breaks[np.cumsum([0, *map(len, ticks[:-1])])] = broken
     return _Sampled(t_ns, q, rate, breaks, np.concatenate(ticks), step_s, error_rad, gaps_s)
@@ -494,16 +501,14 @@ def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, fl
     while True:
         step = total / steps
         ticks = [piece.ticks(step) for piece in smooth]
-        counts = np.cumsum([len(each) - 1 for each in ticks])
+        counts = np.cumsum([len(piece_ticks) - 1 for piece_ticks in ticks])
         error_rad = excess_rad = 0.0
         for place in np.unique(np.linspace(0, counts[-1] - 1, PROBES).astype(int)).tolist():
             k = int(np.searchsorted(counts, place, "right"))
             within = place - (int(counts[k - 1]) if k else 0)
             found_rad, clock_rad = _error_rad(structure, smooth[k], ticks[k], within)
-            error_rad, excess_rad = (
-                max(error_rad, found_rad),
-                max(excess_rad, found_rad - clock_rad),
-            )
+            error_rad = max(error_rad, found_rad)
+            excess_rad = max(excess_rad, found_rad - clock_rad)
         if excess_rad <= TARGET_RAD or 2 * steps > MAX_STEPS:
             return step, error_rad
         steps *= 2
@@ -518,12 +523,11 @@ def _error_rad(
     And the share of it that no step mends: the turn in the time that a double of ephemeris time
     does not resolve.
     """
-    near = [
-        AttitudeSample(t_ns, q, rate)
-        for t_ns, q, rate in zip(
-            *_attitudes(structure, piece, ticks[max(k - 1, 0) : k + 3]), strict=True
-        )
-    ]
+    near = []
+    for t_ns, q, rate in zip(
+        *_attitudes(structure, piece, ticks[max(k - 1, 0) : k + 3]), strict=True
+    ):
+        near.append(AttitudeSample(t_ns, q, rate))
     timeline = Timeline(ALL, len(near), log_joins(near))
     for event in near:
         timeline.add(event)
@@ -544,8 +548,12 @@ def _attitudes(
     has them by difference.
     """
     by_difference = piece.segment.kind in SMOOTH and not piece.segment.has_rate and len(ticks) > 1
-    step = float(ticks[1] - ticks[0]) * DIFFERENCE_STEPS if by_difference else 0.0
-    t_ns, q = np.empty(len(ticks), dtype=np.int64), np.empty((len(ticks), 4))
+    if by_difference:
+        step = float(ticks[1] - ticks[0]) * DIFFERENCE_STEPS
+    else:
+        step = 0.0
+    t_ns = np.empty(len(ticks), dtype=np.int64)
+    q = np.empty((len(ticks), 4))
     rates = np.full((len(ticks), 3), np.nan)
     for k, tick in enumerate(ticks.tolist()):
         t_ns[k] = structure.t_ns(tick)
@@ -567,7 +575,8 @@ def _parted(
     both beside it. The attitude jumps there where it turns by more than it does in the same time
     before.
     """
-    broken, gaps_s = [False], []
+    broken = [False]
+    gaps_s = []
     for k, (before, after) in enumerate(pairwise(pieces), start=1):
         if before.stop < after.start:
             gaps_s.append(structure.t_s(after.start) - structure.t_s(before.stop))
@@ -641,29 +650,29 @@ def _named(spice: Any, meta: Path) -> list[Path]:
 
 def _strings(spice: Any, name: str) -> list[str]:
     """The strings of a variable of the pool; one that ends in + goes on in the next."""
-    found: list[str] = []
+    strings: list[str] = []
     for k in range(MAX_NAMED + 1):
         text, _, there = spice.stpool(name, k, "+")
         if not there:
-            return found
-        found.append(text)
+            return strings
+        strings.append(text)
     raise InputError(f"a meta-kernel has more than {MAX_NAMED} {name}; split it into several")
 
 
 def _in_words(error: Any) -> str:
     """What SPICE says, and what to give where a kernel is missing."""
-    said = shortened(" ".join(str(error.long or error.explain or error.short).split()), 300)
-    if "SCLK" in said and ("not found" in said or "kernel" in said.lower()):
+    reason = shortened(" ".join(str(error.long or error.explain or error.short).split()), 300)
+    if "SCLK" in reason and ("not found" in reason or "kernel" in reason.lower()):
         return (
             "its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc"
-            f" ({said})"
+            f" ({reason})"
         )
-    if "frame" in said.lower():
+    if "frame" in reason.lower():
         return (
             "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its"
-            f" own .bc, or .tpc ({said})"
+            f" own .bc, or .tpc ({reason})"
         )
-    return f"SPICE refuses it ({said})"
+    return f"SPICE refuses it ({reason})"
 
 
 def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sampled, dict[str, Any]]:
@@ -679,13 +688,20 @@ def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sample
                 segments = read_segments(spiceypy, path, handle)
             load(spiceypy, path, kernels)
             body = _body(spiceypy, path, segments, stated)
-            own = [segment for segment in segments if segment.body == body]
-            pieces = _pieces_of(list(zip(own, _coverages(spiceypy, path, own), strict=True)))
+            own_segments = [segment for segment in segments if segment.body == body]
+            pieces = _pieces_of(
+                list(zip(own_segments, _coverages(spiceypy, path, own_segments), strict=True))
+            )
             if not pieces:
                 raise InputError(f"{path}: its segments of {body} cover no time")
-            structure = _Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
+            structure = _Structure(
+                path, spiceypy, body, all(segment.has_rate for segment in own_segments)
+            )
             references = sorted(
-                {spiceypy.frmnam(segment.reference) or str(segment.reference) for segment in own}
+                {
+                    spiceypy.frmnam(segment.reference) or str(segment.reference)
+                    for segment in own_segments
+                }
             )
             return sample(structure, pieces), {
                 "structure": _name(spiceypy, body),
@@ -712,10 +728,10 @@ def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -
         body = int(stated)
     except ValueError:
         frame = spice.namfrm(stated)
-        _, kind, body, found = spice.frinfo(frame) if frame else (0, 0, 0, False)
-        if not found or kind != CK_CLASS:
-            body, found = spice.bods2c(stated)
-            body = body if found else None
+        _, kind, body, is_known = spice.frinfo(frame) if frame else (0, 0, 0, False)
+        if not is_known or kind != CK_CLASS:
+            body, is_known = spice.bods2c(stated)
+            body = body if is_known else None
     if body is None or body not in bodies:
         raise InputError(
             f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its"
@@ -725,8 +741,10 @@ def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -
 
 
 def _name(spice: Any, body: int) -> str:
-    _, name, _, found = spice.ccifrm(CK_CLASS, body)
-    return f"{body} ({name})" if found and name else str(body)
+    _, name, _, is_known = spice.ccifrm(CK_CLASS, body)
+    if is_known and name:
+        return f"{body} ({name})"
+    return str(body)
 
 
 def main() -> None:
@@ -734,21 +752,25 @@ def main() -> None:
     request = json.loads(sys.stdin.read())
     arrays: dict[str, Any] = {}
     try:
-        found, said = answer(
+        sampled, reply = answer(
             Path(request["path"]), [Path(name) for name in request["kernels"]], request["body"]
         )
         arrays = {
-            "t_ns": found.t_ns,
-            "q": found.q,
-            "rate": found.rate,
-            "breaks": found.breaks,
-            "tick": found.tick,
+            "t_ns": sampled.t_ns,
+            "q": sampled.q,
+            "rate": sampled.rate,
+            "breaks": sampled.breaks,
+            "tick": sampled.tick,
         }
-        said |= {"step_s": found.step_s, "error_rad": found.error_rad, "gaps_s": found.gaps_s}
+        reply |= {
+            "step_s": sampled.step_s,
+            "error_rad": sampled.error_rad,
+            "gaps_s": sampled.gaps_s,
+        }
     except InputError as error:
-        said = {"error": str(error)}
+        reply = {"error": str(error)}
     packed = io.BytesIO()
-    np.savez(packed, said=np.array(json.dumps(said)), **arrays)
+    np.savez(packed, said=np.array(json.dumps(reply)), **arrays)
     sys.stdout.buffer.write(packed.getvalue())
 
 

@@ -148,11 +148,10 @@ class CsvLog:
         return bool(cells) and all(cell in FLAGS for cell in cells)
 
     def _tell_rates(self) -> None:
-        headers = [
-            column.header
-            for column in self.table.columns
-            if RATES_OF_OTHERS.fullmatch(plain_name(column.name))
-        ]
+        headers = []
+        for column in self.table.columns:
+            if RATES_OF_OTHERS.fullmatch(plain_name(column.name)):
+                headers.append(column.header)
         if len(headers) >= len(RATE_COLUMNS):
             named = ", ".join(headers)
             self.told.append(
@@ -235,7 +234,8 @@ class CsvLog:
             turning = [cells[column.place].strip() for column in self._rates]
             if any(turning):
                 rate = float(turning[0]), float(turning[1]), float(turning[2])
-        sequence, discontinuity = 0, False
+        sequence = 0
+        discontinuity = False
         if self._sequence is not None:
             sequence = int(cells[self._sequence.place].strip() or 0)
             if sequence not in WHOLE_NUMBERS:
@@ -250,7 +250,10 @@ class CsvLog:
 
 def invalid_notice(count: int, what: str) -> tuple[str, str]:
     """The notice of rows or lines that a log itself marks as not valid."""
-    number = f"1 {what} is" if count == 1 else f"{count} {what}s are"
+    if count == 1:
+        number = f"1 {what} is"
+    else:
+        number = f"{count} {what}s are"
     return VALID_KIND, f"{number} marked as not valid by the log itself, and left out"
 
 

@@ -87,13 +87,15 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
     hours, place = np.unique(
         np.concatenate((utc_ns // HOUR_NS, utc_ns // HOUR_NS + 1)), return_inverse=True
     )
-    before, after = place[: len(utc_ns)], place[len(utc_ns) :]
+    before = place[: len(utc_ns)]
+    after = place[len(utc_ns) :]
     share = (utc_ns % HOUR_NS) / HOUR_NS
 
     def between(values: FloatArray) -> FloatArray:
         return values[before] + share * (values[after] - values[before])
 
-    table, mjd = _table(), UNIX_MJD + hours / 24.0
+    table = _table()
+    mjd = UNIX_MJD + hours / 24.0
     tai_utc_s = _tai_minus_utc_s(hours // 24)
     tt_days = (tai_utc_s + TT_FROM_TAI_S) / 86400.0
     # Linear over an hour, these are within 5 microarcsec: the shortest nutation of note takes 5.5
@@ -107,7 +109,8 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
         ut1_tai_s + tai_utc_s[before]
     ) / 86400.0
     era = erfa.era00(MJD_ZERO_JD + UNIX_MJD + utc_ns // (24 * HOUR_NS), ut1_days)
-    node, tilt = np.arctan2(y, x), np.arcsin(np.hypot(x, y))
+    node = np.arctan2(y, x)
+    tilt = np.arcsin(np.hypot(x, y))
     to_cirs = _chain(frame_turns(2, node), frame_turns(1, tilt), frame_turns(2, -node - s))
     return _chain(to_cirs, frame_turns(2, era), frame_turns(1, -pole_x), frame_turns(0, -pole_y))
 
@@ -180,7 +183,8 @@ def _table() -> _EarthTable:
     from astropy_iers_data import IERS_A_FILE
 
     # UT1, pole
-    a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))
+    a_columns = ((58, 68), (18, 27), (37, 46))
+    b_columns = ((154, 165), (134, 144), (144, 154))
     with Path(IERS_A_FILE).open(encoding="ascii") as file:
         lines = [
             (line, b_columns if line[154:165].strip() else a_columns)
@@ -246,7 +250,8 @@ def _of_hours(frame: str, t_ns: IntArray) -> FloatArray:
         np.concatenate((t_ns // HOUR_NS, t_ns // HOUR_NS + 1)), return_inverse=True
     )
     q = np.array([from_matrix(_matrix(frame, hour / 24.0)) for hour in hours.tolist()])
-    before, after = q[place[: len(t_ns)]], q[place[len(t_ns) :]]
+    before = q[place[: len(t_ns)]]
+    after = q[place[len(t_ns) :]]
     return normalise(before + ((t_ns % HOUR_NS) / HOUR_NS)[:, None] * (after - before))
 
 
@@ -274,7 +279,10 @@ class Reference(NamedTuple):
         utc_ns = np.fromiter(t_ns, dtype=np.int64) + self.utc_ns
         if self.kind == "icrs":
             return np.tile([1.0, 0.0, 0.0, 0.0], (len(utc_ns), 1))
-        turn = q_icrs_to_enu if self.kind == "enu" else q_icrs_to_ned
+        if self.kind == "enu":
+            turn = q_icrs_to_enu
+        else:
+            turn = q_icrs_to_ned
         return turn(utc_ns, np.array(self.place[0]), np.array(self.place[1]))
 
     @property
@@ -318,7 +326,8 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
             f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place"
             " LAT,LON,HEIGHT"
         )
-    dated, utc_ns = first_ns >= FIRST_DATE_NS, 0
+    dated = first_ns >= FIRST_DATE_NS
+    utc_ns = 0
     if dated and stated.epoch_utc is not None:
         raise InputError(
             f"{path}: its times are dates already (ns since 1970); leave out --epoch-utc"
@@ -368,13 +377,17 @@ def to_icrs(
     if reference.kind == "icrs":
         yield from entries
         return
-    first_ns, last_ns = None, 0
+    first_ns = None
+    last_ns = 0
     remaining = iter(entries)
     while batch := list(islice(remaining, BATCH)):
         samples = [entry.event for entry in batch if isinstance(entry.event, AttitudeSample)]
         turned = iter(_from_icrs(samples, reference, gyro))
         if samples:
-            first_ns = samples[0].t_ns if first_ns is None else min(first_ns, samples[0].t_ns)
+            if first_ns is None:
+                first_ns = samples[0].t_ns
+            else:
+                first_ns = min(first_ns, samples[0].t_ns)
             last_ns = max(last_ns, samples[-1].t_ns)
         for entry in batch:
             yield (
@@ -397,10 +410,9 @@ def _from_icrs(
     earths = rotate(q_ref_to_body, np.tile(reference.earth_rate_rad_s, (len(samples), 1)))
     turned = []
     for sample, attitude, earth_rate in zip(samples, q, earths, strict=True):
-        rate = (
-            sample.rate_cam_rad_s
-            if sample.rate_cam_rad_s is None or gyro
-            else sample.rate_cam_rad_s + earth_rate
-        )
+        if sample.rate_cam_rad_s is None or gyro:
+            rate = sample.rate_cam_rad_s
+        else:
+            rate = sample.rate_cam_rad_s + earth_rate
         turned.append(replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate))
     return turned

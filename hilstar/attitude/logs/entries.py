@@ -102,7 +102,8 @@ class Stated:
             if name == "mounting":
                 stated = self.mounting.by_option
             elif name == "convention":
-                stated, option = self.convention is not None, self.convention_by
+                stated = self.convention is not None
+                option = self.convention_by
             else:
                 stated = getattr(self, name) not in (None, ())
             if stated:
@@ -147,7 +148,10 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
     of change.
     """
     waiting: list[tuple[int, int, LogEntry]] = []
-    newest_ns, late, latest_ns, repeats = None, 0, 0, 0
+    newest_ns = None
+    late = 0
+    latest_ns = 0
+    repeats = 0
     last: AttitudeSample | None = None
     ended: Iterator[LogEntry | None] = itertools.chain(entries, (None,))
     for number, entry in enumerate(ended):
@@ -160,8 +164,12 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
                 continue
             t_ns = entry.event.t_ns
             if newest_ns is not None and t_ns < newest_ns:
-                late, latest_ns = late + 1, max(latest_ns, newest_ns - t_ns)
-            newest_ns = t_ns if newest_ns is None else max(newest_ns, t_ns)
+                late = late + 1
+                latest_ns = max(latest_ns, newest_ns - t_ns)
+            if newest_ns is None:
+                newest_ns = t_ns
+            else:
+                newest_ns = max(newest_ns, t_ns)
             heapq.heappush(waiting, (t_ns, number, entry))
         while (
             waiting
@@ -202,8 +210,11 @@ def _repeats(last: AttitudeSample, sample: AttitudeSample) -> bool:
         or not np.array_equal(last.q_icrs_to_cam, sample.q_icrs_to_cam)
     ):
         return False
-    one, other = last.rate_cam_rad_s, sample.rate_cam_rad_s
-    return one is other if one is None or other is None else np.array_equal(one, other)
+    last_rate = last.rate_cam_rad_s
+    other = sample.rate_cam_rad_s
+    if last_rate is None or other is None:
+        return last_rate is other
+    return np.array_equal(last_rate, other)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,14 +234,19 @@ class LogJoins:
         """How a timeline joins two successive samples."""
         if after.discontinuity or before.t_ns in self.held_ns:
             return "hold"
-        return "blend" if before.t_ns in self.blended_ns else "slerp"
+        if before.t_ns in self.blended_ns:
+            return "blend"
+        return "slerp"
 
     @property
     def told(self) -> list[tuple[str, str]]:
         """The kind and the text of each notice for the user."""
         lines = []
         if self.held_ns:
-            gaps = "1 gap" if len(self.held_ns) == 1 else f"{len(self.held_ns)} gaps"
+            if len(self.held_ns) == 1:
+                gaps = "1 gap"
+            else:
+                gaps = f"{len(self.held_ns)} gaps"
             sizes = (
                 f"the longest {self.longest_s:.6g} s (over {GAP_INTERVALS} times its usual"
                 f" {self.usual_s:.6g} s)"
@@ -253,7 +269,10 @@ class LogJoins:
         """
         if not self.misfits:
             return ""
-        reading = None if self.cause is None else self.cause.reading
+        if self.cause is None:
+            reading = None
+        else:
+            reading = self.cause.reading
         return f"{self._misfits}{self._why}" + ("" if reading is None else f": {reading.advice}")
 
     @property
@@ -262,7 +281,9 @@ class LogJoins:
 
     @property
     def _why(self) -> str:
-        return "" if self.cause is None else f"; probably {self.cause.text}"
+        if self.cause is None:
+            return ""
+        return f"; probably {self.cause.text}"
 
 
 def log_joins(
@@ -322,5 +343,6 @@ def _fits(
     step = np.column_stack((np.cos(half), np.sinc(half / np.pi)[:, None] * vector))
     rest = multiply(multiply(q[1:], conjugate(q[:-1])), conjugate(step))
     off_rad = 2 * np.arctan2(np.linalg.norm(rest[:, 1:], axis=1), np.abs(rest[:, 0]))
-    share, most_rad = np.where(gap, GAP_FIT_SHARE, FIT_SHARE), np.where(gap, GAP_FIT_RAD, FIT_RAD)
+    share = np.where(gap, GAP_FIT_SHARE, FIT_SHARE)
+    most_rad = np.where(gap, GAP_FIT_RAD, FIT_RAD)
     return known, known & (off_rad <= np.minimum(share * turned_rad, most_rad) + ALIKE_RAD)

@@ -53,11 +53,11 @@ NO_END = "the array has no ] at its end, as of a file that was cut off; what it 
 def read_json(path: Path, stated: Stated) -> Iterator[LogReading]:
     """The reading of JSON. Raises InputError."""
     with open_lines(path, readable(), MAX_LOG_BYTES, whole_lines=False) as pieces:
-        told: list[tuple[str, str]] = []
-        reading = of_packets(path, _read_objects(pieces, told), "JSON lines", stated)
+        notices: list[tuple[str, str]] = []
+        reading = of_packets(path, _read_objects(pieces, notices), "JSON lines", stated)
         yield reading
         # Complete when the last object is read.
-        reading.told.extend(told)
+        reading.told.extend(notices)
 
 
 def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterator[LogEntry]:

@@ -61,19 +61,22 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
         with check_stated(path, stated).read(path, stated) as reading:
             conventions = reading.conventions
             if mounting.by_option and not conventions.of_body:
-                own = f"{path}: --mounting: its attitudes are the camera's own"
-                raise InputError(f"{own} ({conventions.source}); leave it out")
+                refusal = f"{path}: --mounting: its attitudes are the camera's own"
+                raise InputError(f"{refusal} ({conventions.source}); leave it out")
             samples, unset = _samples(path, reading, mounting)
     except OSError as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
-    told = [*reading.told, *conventions.mounting_notices(mounting)]
+    notices = [*reading.told, *conventions.mounting_notices(mounting)]
     if unset:
-        left_out = "1 attitude is" if unset == 1 else f"{unset} attitudes are"
-        told.append(("log-start", f"{left_out} left out at the beginning: {UNSET}"))
+        if unset == 1:
+            left_out = "1 attitude is"
+        else:
+            left_out = f"{unset} attitudes are"
+        notices.append(("log-start", f"{left_out} left out at the beginning: {UNSET}"))
     if conventions.of_packets:  # other formats say themselves what their times are
-        told += time_notices(samples, conventions.time_unit)
+        notices += time_notices(samples, conventions.time_unit)
     read_as = ReadAs.of(conventions, stated.convention or HILSTARS, mounting, stated.convention_by)
-    return AttitudeLog(samples, conventions, told, read_as)
+    return AttitudeLog(samples, conventions, notices, read_as)
 
 
 def _samples(
@@ -152,7 +155,8 @@ def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None)
     A date and time is read on the log's own scale, from 1970-01-01T00:00:00. Raises InputError
     outside the span.
     """
-    first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
+    first_ns = samples[0].t_ns
+    last_ns = samples[-1].t_ns
     if text is None:
         return first_ns
     try:

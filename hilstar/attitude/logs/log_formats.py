@@ -48,9 +48,9 @@ class LogHead(NamedTuple):
         """The first word of a text's first line that is no comment; "" where there is none."""
         with open_lines(self.path, readable(), MAX_LOG_BYTES, whole_lines=False) as lines:
             for line in lines:
-                words = line.split(maxsplit=1)
-                if words and words[0] != "COMMENT" and not words[0].startswith(("#", "//")):
-                    return words[0]
+                fields = line.split(maxsplit=1)
+                if fields and fields[0] != "COMMENT" and not fields[0].startswith(("#", "//")):
+                    return fields[0]
         return ""
 
 
@@ -106,16 +106,16 @@ def log_formats() -> tuple[LogFormat, ...]:
     A format of another package that cannot be loaded is left out with a warning. Raises
     MachineError where hilstar's own are missing.
     """
-    own: list[LogFormat] = []
+    own_formats: list[LogFormat] = []
     others: list[LogFormat] = []
     for entry, is_own in _registered():
         loaded = entry.load() if is_own else _loaded(entry)
         if loaded is not None:
-            (own if is_own else others).append(loaded)
-    if not own:
+            (own_formats if is_own else others).append(loaded)
+    if not own_formats:
         missing = "hilstar's own log formats are not registered"
         raise MachineError(f"{missing}; install hilstar again: pip install hilstar")
-    return tuple(sorted([*own, *others], key=lambda each: each.closeness))
+    return tuple(sorted([*own_formats, *others], key=lambda each: each.closeness))
 
 
 def _registered() -> Iterator[tuple[EntryPoint, bool]]:
@@ -152,7 +152,10 @@ def _loaded(entry: EntryPoint) -> LogFormat | None:
         loaded = error
     if isinstance(loaded, LogFormat):
         return loaded
-    package = "a package" if entry.dist is None else entry.dist.name
+    if entry.dist is None:
+        package = "a package"
+    else:
+        package = entry.dist.name
     log.warning(
         "the log format %s of %s (%s) is no LogFormat, and is left out: %s",
         entry.name,
@@ -165,15 +168,15 @@ def _loaded(entry: EntryPoint) -> LogFormat | None:
 
 def readable() -> str:
     """What hilstar reads, for a message."""
-    names = [each.listed for each in log_formats() if each.listed]
+    names = [form.listed for form in log_formats() if form.listed]
     return f"hilstar reads {', '.join(names[:-1])} and {names[-1]}"
 
 
 def kinds() -> dict[bytes, str]:
     """What a file is by its first bytes, of every format that has a magic number."""
     kind_of_magic: dict[bytes, str] = {}
-    for each in log_formats():  # of formats with one magic number the last takes any such file
-        kind_of_magic |= dict.fromkeys(each.magic, each.name)
+    for form in log_formats():  # of formats with one magic number the last takes any such file
+        kind_of_magic |= dict.fromkeys(form.magic, form.name)
     return kind_of_magic
 
 
@@ -184,7 +187,7 @@ def format_of(path: Path) -> LogFormat:
         with open_regular(path, readable()) as file:
             head = file.read(HEAD_BYTES)
     beginning = LogHead(path, head)
-    return next(each for each in log_formats() if each.takes(beginning))
+    return next(form for form in log_formats() if form.takes(beginning))
 
 
 def check_stated(path: Path, stated: Stated) -> LogFormat:
@@ -196,7 +199,10 @@ def check_stated(path: Path, stated: Stated) -> LogFormat:
         by_bench = written != OPTIONS[name]
         if name in log_format.uses or (log_format.of_ledgers and by_bench):
             continue  # what a run's bench file says of its packets, its ledger has already done
-        reason = " has a convention of its own" if name == "convention" else " does not use it"
+        if name == "convention":
+            reason = " has a convention of its own"
+        else:
+            reason = " does not use it"
         raise InputError(f"{path}: {written}: {log_format.name}{reason}; leave it out")
     return log_format
 
@@ -205,12 +211,12 @@ def writer_of(path: Path) -> tuple[Writer, str]:
     """The writer of a name's ending, and that ending. Raises InputError for any other ending."""
     ending = path.suffix.lower()
     endings: list[str] = []
-    for each in log_formats():
-        if each.write is None:
+    for form in log_formats():
+        if form.write is None:
             continue
-        if ending in each.endings:
-            return each.write, ending
-        endings += each.endings
+        if ending in form.endings:
+            return form.write, ending
+        endings += form.endings
     raise InputError(f"{path}: not a log's name; end it in one of {', '.join(endings)}")
 
 

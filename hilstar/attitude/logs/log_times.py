@@ -44,11 +44,9 @@ RATES_LIKE = {1e-3: "mrad/s", 1e3: "rad/ms"}
 def median_step_s(samples: Sequence[AttitudeSample]) -> float:
     """The median interval of a log, s; NaN of a single sample."""
     t_ns = np.array([sample.t_ns for sample in samples], dtype=object)
-    return (
-        float(np.median(np.asarray(np.diff(t_ns) / NS_PER_S, dtype=np.float64)))
-        if len(samples) > 1
-        else float("nan")
-    )
+    if len(samples) > 1:
+        return float(np.median(np.asarray(np.diff(t_ns) / NS_PER_S, dtype=np.float64)))
+    return float("nan")
 
 
 def span_line(samples: Sequence[AttitudeSample]) -> str:
@@ -76,7 +74,10 @@ def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str
         ]
     if MIN_STEP_S <= step_s <= MAX_STEP_S:
         return []
-    limit = f"over {MAX_STEP_S:g} s" if step_s > MAX_STEP_S else f"under {MIN_STEP_S * 1e3:g} ms"
+    if step_s > MAX_STEP_S:
+        limit = f"over {MAX_STEP_S:g} s"
+    else:
+        limit = f"under {MIN_STEP_S * 1e3:g} ms"
     return [
         (
             TIMES,
@@ -101,7 +102,9 @@ def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:
         if rates is None or not MIN_STEP_S <= step_s <= MAX_STEP_S:
             return line
         other = f"the rates are in {rates}"
-        return f"{line}, or {other}" if MIN_STEP_S <= step_s * factor <= MAX_STEP_S else other
+        if MIN_STEP_S <= step_s * factor <= MAX_STEP_S:
+            return f"{line}, or {other}"
+        return other
     return ""
 
 
@@ -131,13 +134,19 @@ def _too_far(samples: Sequence[AttitudeSample]) -> float:
 
 
 def _ratio(turned: FloatArray, by_rate: FloatArray) -> float:
-    lengths, others = np.linalg.norm(turned, axis=1), np.linalg.norm(by_rate, axis=1)
+    lengths = np.linalg.norm(turned, axis=1)
+    others = np.linalg.norm(by_rate, axis=1)
     turns = (lengths > MIN_TURN_RAD) & (others > 0)
     if turns.sum() < MIN_INTERVALS:
         return float("nan")
-    turned, by_rate, lengths, others = turned[turns], by_rate[turns], lengths[turns], others[turns]
+    turned = turned[turns]
+    by_rate = by_rate[turns]
+    lengths = lengths[turns]
+    others = others[turns]
     cosines = (turned * by_rate).sum(axis=1) / (lengths * others)
-    return float(np.median(others / lengths)) if np.median(cosines) > MIN_COSINE else float("nan")
+    if np.median(cosines) > MIN_COSINE:
+        return float(np.median(others / lengths))
+    return float("nan")
 
 
 def ns_of_seconds(seconds: str) -> int:

@@ -126,7 +126,9 @@ class TooLargeError(DamageError):
 
 def part_path(path: Path, part: int) -> Path:
     """The name of part 1, 2, ... of a run whose ledger begins at `path`: RUN.0001.mcap and on."""
-    return path.with_name(f"{path.stem}.{part:04d}{path.suffix}") if part else path
+    if part:
+        return path.with_name(f"{path.stem}.{part:04d}{path.suffix}")
+    return path
 
 
 def parts_of(path: Path) -> list[Path]:
@@ -136,8 +138,11 @@ def parts_of(path: Path) -> list[Path]:
     head = read_metadata(path, RUN_METADATA)
     parts = [path]
     while head.get("part") == "0" and (following := part_path(path, len(parts))).is_file():
-        own = read_metadata(following, RUN_METADATA)
-        if (own.get("run_id"), own.get("part")) != (head.get("run_id"), str(len(parts))):
+        own_metadata = read_metadata(following, RUN_METADATA)
+        if (own_metadata.get("run_id"), own_metadata.get("part")) != (
+            head.get("run_id"),
+            str(len(parts)),
+        ):
             break
         parts.append(following)
     return parts
@@ -153,15 +158,15 @@ def read_chunks(path: Path, *, tell: bool = True) -> Iterator[tuple[Topics, Mess
     """
     for part in parts_of(path):
         topics: dict[int, str] = {}
-        told: Topics = {}
+        channels: Topics = {}
         for record in records_of(part, topics):
             if isinstance(record, list):
-                yield told, record
+                yield channels, record
             elif isinstance(record, kinds.Channel):
                 topics[record.id] = record.topic
-                told = dict(topics)
+                channels = dict(topics)
             elif isinstance(record, kinds.Message) and record.channel_id in topics:
-                yield told, [(record.channel_id, record.data)]
+                yield channels, [(record.channel_id, record.data)]
     unfinished = unfinished_part(path) if tell else None
     if unfinished is not None:
         log.warning("%s %s", unfinished, NO_END)
@@ -228,12 +233,17 @@ def holds_ros(path: Path) -> bool:
     """
     channels = (record for record in records_of(path) if isinstance(record, kinds.Channel))
     encodings = (
-        one.message_encoding
-        for one in channels
-        if one.message_encoding != "json" or one.topic in OWN_TOPICS
+        encoding.message_encoding
+        for encoding in channels
+        if encoding.message_encoding != "json" or encoding.topic in OWN_TOPICS
     )
     return next(
-        (one in ROS_ENCODINGS for one in encodings if one in {*ROS_ENCODINGS, "json"}), False
+        (
+            encoding in ROS_ENCODINGS
+            for encoding in encodings
+            if encoding in {*ROS_ENCODINGS, "json"}
+        ),
+        False,
     )
 
 
@@ -254,11 +264,15 @@ def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[An
         reader = _Reader(file, size)
         records = reader.all()
         # making one takes longer than unpacking a chunk
-        room, zstd = FREE_BYTES + MAX_INFLATION * size, Zstd()
+        room = FREE_BYTES + MAX_INFLATION * size
+        zstd = Zstd()
         while True:
             try:
                 record = next(records, None)
-                data = _unpacked(record, room, zstd) if isinstance(record, kinds.Chunk) else None
+                if isinstance(record, kinds.Chunk):
+                    data = _unpacked(record, room, zstd)
+                else:
+                    data = None
             except Exception as error:
                 # the reader passes on what struct, zstd, lz4 and UTF-8 raise
                 cut_off = isinstance(error, RecordLengthLimitExceeded) or reader.place == size
@@ -289,19 +303,21 @@ class _Reader(StreamReader):
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         super().__init__(self, emit_chunks=True, record_size_limit=size)  # type: ignore[arg-type]
-        self._file, self._size, self.place = file, size, 0
+        self._file = file
+        self._size = size
+        self.place = 0
         self._crcs = (0, 0, 0)  # CRC-32 of the file up to two reads ago, to one, and to here
 
     def read(self, length: int) -> bytes:
         """At most `length` bytes, for the library. Raises TooLargeError for a record over
         MAX_RECORD_BYTES.
         """
-        left = self._size - self.place
-        if MAX_RECORD_BYTES < length <= left:
+        rest_bytes = self._size - self.place
+        if MAX_RECORD_BYTES < length <= rest_bytes:
             raise TooLargeError(
                 f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read"
             )
-        data = self._file.read(min(length, left))
+        data = self._file.read(min(length, rest_bytes))
         self.place += len(data)
         self._crcs = (*self._crcs[1:], zlib.crc32(data, self._crcs[-1]))
         return data
@@ -319,11 +335,13 @@ class _Reader(StreamReader):
         """
         at = PIECE_BYTES
         while at:
-            begin, at = self.place, 0
+            begin = self.place
+            at = 0
             piece = self._file.read(min(PIECE_BYTES, self._size - begin))
             while at + 9 <= len(piece):
                 opcode, length = _record_head.unpack_from(piece, at)
-                body, end = at + 9, at + 9 + length
+                body = at + 9
+                end = at + 9 + length
                 if end > len(piece):
                     break
                 if opcode == CHUNK and length >= _chunk_head.size:
@@ -337,9 +355,10 @@ class _Reader(StreamReader):
                         "zstd", piece[end - packed : end], last_ns, first_ns, crc, size
                     )
                 elif opcode == CHUNK_INDEX and length >= 68:
-                    offsets = (
-                        (length - 68).to_bytes(4, "little") if (length - 68) % 10 == 0 else b""
-                    )
+                    if (length - 68) % 10 == 0:
+                        offsets = (length - 68).to_bytes(4, "little")
+                    else:
+                        offsets = b""
                     if (
                         piece[body + 32 : body + 36] != offsets
                         or piece[end - 24 : end - 16] != ZSTD
@@ -353,7 +372,10 @@ class _Reader(StreamReader):
 
     def _read_record(self, opcode: int, length: int) -> kinds.McapRecord | None:
         before = self._crcs[0]  # the opcode and the length were read since
-        record = None if opcode == MESSAGE_INDEX else super()._read_record(opcode, length)
+        if opcode == MESSAGE_INDEX:
+            record = None
+        else:
+            record = super()._read_record(opcode, length)
         if isinstance(record, kinds.DataEnd) and record.data_section_crc not in {0, before}:
             raise CRCValidationError(record.data_section_crc, before, record)
         return record
@@ -368,9 +390,10 @@ def _is_finished(file: IO[bytes]) -> bool:
 def _refused(path: Path, place: int, error: Exception) -> InputError:
     if isinstance(error, TooLargeError):
         return InputError(f"{path}: {error}; {ADVICE}")
-    detail = (
-        str(error) if isinstance(error, DamageError) else f"{type(error).__name__} {error}".strip()
-    )
+    if isinstance(error, DamageError):
+        detail = str(error)
+    else:
+        detail = f"{type(error).__name__} {error}".strip()
     return InputError(f"{path}: is damaged before byte {place} ({detail}); record the log again")
 
 
@@ -384,9 +407,10 @@ def unpacked(
         with (zstd or Zstd()).stream_reader(data) as stream:
             whole = stream.read(limit + 1)
     elif compression in {"bz2", "lz4"}:
-        unpacker = (
-            bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
-        )
+        if compression == "bz2":
+            unpacker = bz2.BZ2Decompressor()
+        else:
+            unpacker = lz4.frame.LZ4FrameDecompressor()
         whole = unpacker.decompress(data, max_length=limit + 1)
     else:
         whole = data
@@ -415,14 +439,17 @@ def _unpacked(chunk: kinds.Chunk, room: int, zstd: Zstd) -> bytes:
 
 
 def _messages_in(data: bytes, topics: Topics) -> Messages | None:
-    place, end, found = 0, len(data), []
+    place = 0
+    end = len(data)
+    messages = []
     while place + HEAD_BYTES <= end:
         opcode, length, channel = _message_start(data, place)
         if opcode != MESSAGE or length < _message_head.size or channel not in topics:
             return None
-        body, place = place + HEAD_BYTES, place + 9 + length
-        found.append((channel, data[body:place]))
-    return found if place == end else None
+        body = place + HEAD_BYTES
+        place = place + 9 + length
+        messages.append((channel, data[body:place]))
+    return messages if place == end else None
 
 
 def _inside(data: bytes) -> Iterator[kinds.McapRecord]:
@@ -522,20 +549,22 @@ class McapWriter:
 
     def take_over(self, other: Self) -> None:
         """Take the messages that another writer of the same topics has not written yet."""
-        self._pending, self.pending_bytes = other._pending, other.pending_bytes
-        other._pending, other.pending_bytes = [], 0
+        self._pending = other._pending
+        self.pending_bytes = other.pending_bytes
+        other._pending = []
+        other.pending_bytes = 0
 
     def drop(self, key: str | None = None) -> int:
         """Forget the messages of a topic (None: of all) that are not written yet; returns their
         number.
         """
-        kept = (
-            []
-            if key is None
-            else [entry for entry in self._pending if entry.channel != self._ids[key]]
-        )
-        dropped = len(self._pending) - len(kept)
-        self._pending, self.pending_bytes = kept, sum(len(entry.record) for entry in kept)
+        if key is None:
+            remaining = []
+        else:
+            remaining = [entry for entry in self._pending if entry.channel != self._ids[key]]
+        dropped = len(self._pending) - len(remaining)
+        self._pending = remaining
+        self.pending_bytes = sum(len(entry.record) for entry in remaining)
         return dropped
 
     def flush(self) -> None:
@@ -544,7 +573,8 @@ class McapWriter:
             return
         data = b"".join(entry.record for entry in self._pending)
         times_ns = [entry.time_ns for entry in self._pending]
-        first_ns, last_ns = min(times_ns), max(times_ns)
+        first_ns = min(times_ns)
+        last_ns = max(times_ns)
         packed = self._compressor.compress(data)
         chunk = _bytes_of(
             kinds.Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data))
@@ -555,13 +585,16 @@ class McapWriter:
         for channel, time_ns, record in self._pending:
             entries.setdefault(channel, []).append((time_ns, offset))
             offset += len(record)
-        indexes, offsets, place = b"", {}, self.size_bytes
+        indexes = b""
+        offsets = {}
+        place = self.size_bytes
         for channel, records in entries.items():
             offsets[channel] = place + len(chunk) + len(indexes)
             indexes += _bytes_of(kinds.MessageIndex(channel, records))
         self._append(chunk + indexes)
         self._counts.update(entry.channel for entry in self._pending)
-        self._pending, self.pending_bytes = [], 0
+        self._pending = []
+        self.pending_bytes = 0
         self._chunks += 1
         self._times_ns += [first_ns, last_ns]
         self._times_ns = [min(self._times_ns), max(self._times_ns)]
@@ -579,7 +612,8 @@ class McapWriter:
             )
             self._index += _bytes_of(entry)
         if len(self._index) > MAX_INDEX_BYTES:
-            self._indexed, self._index = False, bytearray()
+            self._indexed = False
+            self._index = bytearray()
 
     def finish(self) -> None:
         """Write what was added, the index and the end. Raises OSError; the file is then as if
@@ -600,7 +634,8 @@ class McapWriter:
             Opcode.CHUNK_INDEX: bytes(self._index),
             Opcode.METADATA_INDEX: _bytes_of(self._metadata_index),
         }
-        summary, offsets = b"", b""
+        summary = b""
+        offsets = b""
         for opcode, group in groups.items():
             if group:
                 offsets += _bytes_of(kinds.SummaryOffset(opcode, start + len(summary), len(group)))
@@ -657,11 +692,10 @@ def attitude_message(
     """The JSON of an accepted sample; `receive_ns` is the receiver's clock at arrival, `raw` the
     packet as received.
     """
-    q, rate = tuple(sample.q_icrs_to_cam.tolist()), sample.rate_cam_rad_s
-    turning, packet = (
-        None if rate is None else tuple(rate.tolist()),
-        None if raw is None else raw.hex(),
-    )
+    q = tuple(sample.q_icrs_to_cam.tolist())
+    rate = sample.rate_cam_rad_s
+    turning = None if rate is None else tuple(rate.tolist())
+    packet = None if raw is None else raw.hex()
     return _encoder.encode(
         _Form(
             sample.t_ns, sample.sequence, q, turning, sample.discontinuity, receive_ns, raw=packet
@@ -671,7 +705,8 @@ def attitude_message(
 
 def refused_message(reason: str, detail: str, receive_ns: int | None, raw: bytes | None) -> bytes:
     """The JSON of a refused packet, with "reason: detail"."""
-    packet, why = None if raw is None else raw.hex(), f"{reason}: {detail}"
+    packet = None if raw is None else raw.hex()
+    why = f"{reason}: {detail}"
     return _encoder.encode(
         _Form(None, None, receive_ns=receive_ns, accepted=False, reason=why, raw=packet)
     )

@@ -43,10 +43,17 @@ def of_packets(
 
     Rates are with respect to the reference, in the frame's own components.
     """
-    convention = HILSTARS if stated.convention is None else stated.convention
-    by = [] if stated.convention is None else [stated.convention_by]
+    if stated.convention is None:
+        convention = HILSTARS
+    else:
+        convention = stated.convention
+    if stated.convention is None:
+        by = []
+    else:
+        by = [stated.convention_by]
     if stated.mounting.by_option:  # which says that the attitudes are the body's
-        convention, by = structs.replace(convention, frame="body"), [*by, OPTIONS["mounting"]]
+        convention = structs.replace(convention, frame="body")
+        by = [*by, OPTIONS["mounting"]]
     notices: list[tuple[str, str]] = []
     if convention != HILSTARS:
         notices.append(("log-convention", f"read with convention = {convention} ({', '.join(by)})"))

@@ -126,24 +126,22 @@ def turns(type_name: str, message: Any) -> Iterator[_RosTurn]:
         for transform in message.transforms:
             yield from turns(TRANSFORM, transform)
         return
-    q, header = QUATERNIONS[type_name](message), getattr(message, "header", None)
+    q = QUATERNIONS[type_name](message)
+    header = getattr(message, "header", None)
     stamp_ns = reference = body = rate = fault = None
     if header is not None:
-        stamp_ns, reference = (
-            int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec),
-            frame(header.frame_id),
-        )
+        stamp_ns = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
+        reference = frame(header.frame_id)
     if type_name in {TRANSFORM, ODOMETRY}:
         body = frame(message.child_frame_id)
     if type_name == ODOMETRY:
         rate = _vector(message.twist.twist.angular)
     elif type_name == IMU:
         reference, body = None, reference
-        rate = (
-            None
-            if message.angular_velocity_covariance[0] == -1
-            else _vector(message.angular_velocity)
-        )
+        if message.angular_velocity_covariance[0] == -1:
+            rate = None
+        else:
+            rate = _vector(message.angular_velocity)
         if message.orientation_covariance[0] == -1:
             fault = "orientation_covariance[0] is -1: the IMU gives no orientation"
     yield _RosTurn(stamp_ns, reference, body, (q.w, q.x, q.y, q.z), rate, type_name == IMU, fault)
@@ -181,7 +179,9 @@ class _Edge:
     def times_ns(self) -> IntArray:
         """(n,): the stamps, or where they are not set when the transforms were recorded."""
         stamps = np.array(self.stamps_ns, dtype=np.int64)
-        return stamps if stamps.any() else np.array(self.received_ns, dtype=np.int64)
+        if stamps.any():
+            return stamps
+        return np.array(self.received_ns, dtype=np.int64)
 
     def at(self, t_ns: IntArray) -> FloatArray:
         """The rotations (m, 4) at other times (m,); NaN before its first and after its last."""
@@ -195,9 +195,9 @@ class _Edge:
         after = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
         share = (t_ns - times[after - 1]) / (times[after] - times[after - 1])
         turn = to_rotation_vector(multiply(q[after], conjugate(q[after - 1])))
-        found = multiply(from_rotation_vectors(share[:, None] * turn), q[after - 1])
-        found[(t_ns < times[0]) | (t_ns > times[-1])] = np.nan
-        return found
+        turned_q = multiply(from_rotation_vectors(share[:, None] * turn), q[after - 1])
+        turned_q[(t_ns < times[0]) | (t_ns > times[-1])] = np.nan
+        return turned_q
 
 
 class _FrameChain(NamedTuple):
@@ -219,15 +219,16 @@ class _FrameChain(NamedTuple):
         whole = np.tile([1.0, 0.0, 0.0, 0.0], (len(t_ns), 1))
         known = np.ones(len(t_ns), dtype=bool)
         for edge in self.edges:
-            part = self.timed.q if edge is self.timed else edge.at(t_ns)
+            if edge is self.timed:
+                part = self.timed.q
+            else:
+                part = edge.at(t_ns)
             known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
             # numbers of the timed part that are not finite are refused where they are checked
             with np.errstate(all="ignore"):
                 whole = multiply(part, whole)
-        others, name = (
-            [edge for edge in self.edges if edge.moves and edge is not self.timed],
-            _edge_names([self.timed]),
-        )
+        others = [edge for edge in self.edges if edge.moves and edge is not self.timed]
+        name = _edge_names([self.timed])
         if others:
             told.append(
                 ("log-tf", f"{_edge_names(others)} interpolated (SLERP) to the times of {name}")
@@ -242,10 +243,8 @@ class _FrameChain(NamedTuple):
                     ),
                 )
             )
-        received_ns, stamps_ns = (
-            np.array(self.timed.received_ns)[known],
-            np.array(self.timed.stamps_ns)[known],
-        )
+        received_ns = np.array(self.timed.received_ns)[known]
+        stamps_ns = np.array(self.timed.stamps_ns)[known]
         rows = zip(received_ns.tolist(), stamps_ns.tolist(), whole[known].tolist(), strict=True)
         for number, (received, stamp_ns, (w, x, y, z)) in enumerate(rows, start=1):
             turn = _RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
@@ -258,7 +257,8 @@ class _Tree:
         self._up: dict[str, dict[str, _Edge]] = {}
         count = 0
         for _, received_ns, turn in transforms:
-            body, reference = turn.body or "", turn.reference or ""
+            body = turn.body or ""
+            reference = turn.reference or ""
             parents = self._up.setdefault(body, {})
             if reference not in parents:
                 parents[reference] = _Edge(reference, body)
@@ -300,8 +300,9 @@ class _Tree:
         return _FrameChain(body, edges[-1].parent, edges, timed)
 
     def _edges(self, body: str, reference: str | None) -> tuple[_Edge, ...]:
-        found: list[_Edge] = []
-        frame, seen = body, {body}
+        edges: list[_Edge] = []
+        frame = body
+        visited = {body}
         while frame in self._up and frame != reference:
             parents = list(self._up[frame].values())
             if len(parents) > 1:
@@ -309,23 +310,22 @@ class _Tree:
                     f"{self._path}: in tf, {frame!r} has several parents: {_edge_names(parents)};"
                     " record one of them"
                 )
-            found.append(parents[0])
+            edges.append(parents[0])
             frame = parents[0].parent
-            if frame in seen:
+            if frame in visited:
                 raise InputError(
-                    f"{self._path}: tf goes in a circle at {frame!r}: {_edge_names(found)}"
+                    f"{self._path}: tf goes in a circle at {frame!r}: {_edge_names(edges)}"
                 )
-            seen.add(frame)
-        if not found or (reference is not None and frame != reference):
-            wanted = (
-                f"from {body!r} up to {reference!r}"
-                if reference is not None and found
-                else f"of {body!r}"
-            )
+            visited.add(frame)
+        if not edges or (reference is not None and frame != reference):
+            if reference is not None and edges:
+                wanted = f"from {body!r} up to {reference!r}"
+            else:
+                wanted = f"of {body!r}"
             raise InputError(
                 f"{self._path}: tf has no transform {wanted}; it has {_edge_names(self._all())}"
             )
-        return tuple(found)
+        return tuple(edges)
 
 
 def _edge_names(edges: Sequence[_Edge]) -> str:
@@ -349,7 +349,9 @@ def named(reference: str | None) -> tuple[str | None, Kind | None]:
             f"--reference {reference}: the axes of {frame} are {FORM}; write --reference"
             f" {frame}=icrs, for example"
         )
-    return (reference, None) if kind is None else (frame or None, kind)
+    if kind is None:
+        return (reference, None)
+    return (frame or None, kind)
 
 
 def _kind_of_frame(
@@ -364,17 +366,20 @@ def _kind_of_frame(
     refers = f"{path}: its attitudes refer to the frame {frame!r}"
     if frame is not None and wanted is not None and wanted != frame:
         raise InputError(f"{refers}, not to {wanted!r}; write --reference {frame}=icrs")
-    own = KINDS.get((frame or "").lower())
+    own_kind = KINDS.get((frame or "").lower())
     if kind is None:
-        if own is None:
+        if own_kind is None:
             raise InputError(f"{refers if frame else f'{path}: {why}'}; {STATE}")
-        if (frame or "").lower() not in EXACT and own == "icrs":
+        if (frame or "").lower() not in EXACT and own_kind == "icrs":
             told.append(("reference", loosely_icrs(str(frame))))
-        return own
-    if own is None:
-        called = f"the frame {frame!r}" if frame else "the reference"
+        return own_kind
+    if own_kind is None:
+        if frame:
+            called = f"the frame {frame!r}"
+        else:
+            called = "the reference"
         told.append(("reference", f"{called} is taken as {AXES[kind]}, as stated"))
-    elif own != kind:
+    elif own_kind != kind:
         raise InputError(f"{refers}, which is not {AXES[kind]}; leave out --reference")
     return kind
 
@@ -385,7 +390,9 @@ class _Heard(NamedTuple):
     turn: _RosTurn
 
     def t_ns(self, stamped: bool) -> int:
-        return (self.turn.stamp_ns or 0) if stamped else self.receive_ns
+        if stamped:
+            return self.turn.stamp_ns or 0
+        return self.receive_ns
 
 
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
@@ -399,11 +406,14 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
             f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS"
             " defines it"
         )
-    told: list[tuple[str, str]] = []
-    every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
+    notices: list[tuple[str, str]] = []
+    if topic.type in TF_TYPES:
+        every = _of_tf(bag, topic, stated, notices)
+    else:
+        every = _of_topic(bag, topic)
     first, stamped, heard = _begin(bag, topic, every, stated.body)
     if not stamped:
-        told.append(
+        notices.append(
             (
                 "log-stamp",
                 (
@@ -415,14 +425,14 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
     if topic.type == IMU:
         why += " (ROS recommends east, north, up: REP 145)"
-    kind = _kind_of_frame(bag.path, first.turn.reference, stated, why, told)
+    kind = _kind_of_frame(bag.path, first.turn.reference, stated, why, notices)
     reference = stated_reference(bag.path, kind, stated, first.t_ns(stamped))
-    entries = to_icrs(_entries(heard, first.turn, stamped), reference, first.turn.gyro, told)
+    entries = to_icrs(_entries(heard, first.turn, stamped), reference, first.turn.gyro, notices)
     body = first.turn.body
     # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would
     # turn it twice.
     if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
-        told.append(
+        notices.append(
             (
                 "mounting",
                 (
@@ -432,7 +442,10 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
             )
         )
     return LogReading(
-        in_order(entries, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told
+        in_order(entries, notices),
+        _conventions(topic, first, stamped, reference),
+        ORDER_ADVICE,
+        notices,
     )
 
 
@@ -513,12 +526,12 @@ def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[_Heard]:
     for number, message in enumerate(bag.messages(topic), start=1):
         where = f": message {number} of {topic.name}"
         try:
-            found = list(turns(topic.type, bag.decoded(topic, message.data)))
+            topic_turns = list(turns(topic.type, bag.decoded(topic, message.data)))
         except Exception as error:  # rosbags's generated code raises what its bytes lead to
             raise InputError(
                 f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again"
             ) from error
-        yield from (_Heard(where, message.receive_ns, turn) for turn in found)
+        yield from (_Heard(where, message.receive_ns, turn) for turn in topic_turns)
 
 
 def _of_tf(
@@ -526,13 +539,17 @@ def _of_tf(
 ) -> Iterator[_Heard]:
     """The chain of transforms that is stated, from this topic and the static one beside it."""
     beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
-    statics = [
-        other
-        for other in bag.topics()
-        if other.type in TF_TYPES and other.name == beside and other != topic
-    ]
-    tree = _Tree(bag.path, chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic]))
-    body = None if stated.body is None else frame(stated.body)
+    statics = []
+    for other in bag.topics():
+        if other.type in TF_TYPES and other.name == beside and other != topic:
+            statics.append(other)
+    tree = _Tree(
+        bag.path, chain.from_iterable(_of_topic(bag, tf_topic) for tf_topic in [*statics, topic])
+    )
+    if stated.body is None:
+        body = None
+    else:
+        body = frame(stated.body)
     yield from tree.chain(body, named(stated.reference)[0]).heard(told)
 
 
@@ -540,7 +557,10 @@ def _entries(heard: Iterator[_Heard], first: _RosTurn, stamped: bool) -> Iterato
     """Each attitude from the reference to the body, at its time, or why it is none."""
     for each in heard:
         w, x, y, z = each.turn.q
-        fault = None if is_unset(each.turn.q) else _fault(each.turn, first, stamped)
+        if is_unset(each.turn.q):
+            fault = None
+        else:
+            fault = _fault(each.turn, first, stamped)
         yield LogEntry(
             each.where, fault or checked_sample(each.t_ns(stamped), (w, -x, -y, -z), each.turn.rate)
         )
@@ -568,18 +588,18 @@ def _fault(turn: _RosTurn, first: _RosTurn, stamped: bool) -> Refusal | None:
 def _conventions(
     topic: BagTopic, first: _Heard, stamped: bool, reference: Reference
 ) -> Conventions:
-    turn, t_ns = first.turn, first.t_ns(stamped)
+    turn = first.turn
+    t_ns = first.t_ns(stamped)
     if not stamped:
         time = "when each message was recorded, ns since 1970"
     elif t_ns >= FIRST_DATE_NS:
         time = "header.stamp: UTC, ns since 1970-01-01T00:00:00, leap seconds not counted"
     else:
         time = "header.stamp: seconds of a simulated clock"
-    rates = (
-        "; the gyroscope's rate, with respect to the stars"
-        if turn.gyro and turn.rate is not None
-        else ""
-    )
+    if turn.gyro and turn.rate is not None:
+        rates = "; the gyroscope's rate, with respect to the stars"
+    else:
+        rates = ""
     body = f"'{turn.body}'" if turn.body else "the body"
     frames = f"{body} into those of " + (
         f"'{turn.reference}'" if turn.reference else "the reference"
@@ -587,7 +607,10 @@ def _conventions(
 
     def written(q: FloatArray) -> str:
         of_body = multiply(reference.q_icrs_to_reference([t_ns])[0], conjugate(q))
-        when = "" if reference.kind == "icrs" else f" at {t_ns / NS_PER_S:.9f} s"
+        if reference.kind == "icrs":
+            when = ""
+        else:
+            when = f" at {t_ns / NS_PER_S:.9f} s"
         return f"x y z w = {components(np.roll(of_body, -1))}{when}"
 
     return Conventions(

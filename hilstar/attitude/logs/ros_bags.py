@@ -70,7 +70,8 @@ class Bag:
     """A bag that is open for reading."""
 
     def __init__(self, path: Path, reader: "AnyReader") -> None:
-        self.path, self._reader = path, reader
+        self.path = path
+        self._reader = reader
 
     def topics(self) -> list[BagTopic]:
         """Each topic once for each type of its messages, in the order of the bag."""
@@ -78,7 +79,7 @@ class Bag:
         for connection in self._reader.connections:
             by_name.setdefault((connection.topic, connection.msgtype), []).append(connection)
         named = by_name.items()
-        return [BagTopic(name, kind, tuple(each)) for (name, kind), each in named]
+        return [BagTopic(name, kind, tuple(connections)) for (name, kind), connections in named]
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic in the order of their recording. Raises InputError for damage."""
@@ -94,14 +95,16 @@ class Bag:
 
     def has_own_fields(self, topic: BagTopic) -> bool:
         """Whether the bag defines the topic's type, and all within it, as ROS does."""
-        theirs, ours = self._reader.typestore.fielddefs, own_types(self._reader.is2).fielddefs
-        waiting, seen = [topic.type], set()
+        theirs = self._reader.typestore.fielddefs
+        ours = own_types(self._reader.is2).fielddefs
+        waiting = [topic.type]
+        visited = set()
         while waiting:
             kind = waiting.pop()
             known = TF if kind == OLD_TF else kind
-            if kind in seen or known not in ours:
+            if kind in visited or known not in ours:
                 continue
-            seen.add(kind)
+            visited.add(kind)
             if kind not in theirs or theirs[kind][1] != ours[known][1]:
                 return False
             waiting += _inner_types(theirs[kind][1])
@@ -132,7 +135,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
     bound_unpacking()
     with temporary_folder("bag") as place, contextlib.ExitStack() as stack:
-        named = _directory(path) if path.is_dir() else _by_its_ending(path, place)
+        if path.is_dir():
+            named = _directory(path)
+        else:
+            named = _by_its_ending(path, place)
         with _readable(path):
             types = own_types(named.suffix != ".bag")
             reader = stack.enter_context(AnyReader([named], default_typestore=types))
@@ -193,8 +199,8 @@ def _readable(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # its readers pass on what struct, sqlite, yaml and others raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        said = f"{path}: rosbags cannot read it ({shortened(reason)})"
-        raise InputError(f"{said}; {_mend(path, reason)}") from error
+        refusal = f"{path}: rosbags cannot read it ({shortened(reason)})"
+        raise InputError(f"{refusal}; {_mend(path, reason)}") from error
 
 
 def _mend(path: Path, reason: str) -> str:

@@ -161,19 +161,21 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
     text = read_text(path, "write a shorter file", MAX_BYTES)
     with faults_named(path):
         file = _parsed(text)
-        told = _cut_to_count(file)
+        notices = _cut_to_count(file)
         reading = read_blocks([_block(file)], q_icrs_to_date)
-    told += reading.told
+    notices += reading.told
     if "scenarioepoch" not in file.keywords and file.value("timeformat", "epsec") in SECONDS:
-        told.append(("log-times", f"its times are {NO_DATE}"))
-    yield replace(reading, conventions=_conventions(reading.conventions, file), told=told)
+        notices.append(("log-times", f"its times are {NO_DATE}"))
+    yield replace(reading, conventions=_conventions(reading.conventions, file), told=notices)
 
 
 def _parsed(text: str) -> _StkFile:
     """The keywords and the rows of a file's text. Raises AemFaultError."""
-    file, section = _StkFile(), "start"
+    file = _StkFile()
+    section = "start"
     for number, raw in enumerate(io.StringIO(text, newline=None), start=1):
-        where, line = f":{number}", raw.split("#", 1)[0].strip()
+        where = f":{number}"
+        line = raw.split("#", 1)[0].strip()
         if not line or (section == "start" and line.startswith(VERSION)):
             continue
         plain = " ".join(line.upper().split())
@@ -183,7 +185,8 @@ def _parsed(text: str) -> _StkFile:
                 raise AemFaultError(where, f"{detail}; only attitude files of STK are read")
             section = "keywords"
         elif plain == END:
-            file.has_end, section = True, "end"
+            file.has_end = True
+            section = "end"
         elif section == "keywords":
             section = _add_keyword(file, where, line)
         elif section == "data":
@@ -221,16 +224,16 @@ def _add_keyword(file: _StkFile, where: str, line: str) -> str:
 def _add_row(file: _StkFile, where: str, line: str) -> None:
     count = COUNTS[file.form]
     wanted = f"write a time and {count} numbers for {file.form}"
-    words = line.split()
+    fields = line.split()
     # None where the row is too short: a negative end would count from the row's own end.
-    time_words = words[: max(len(words) - count, 0)]
+    time_words = fields[: max(len(fields) - count, 0)]
     quoted = line[:MAX_QUOTED_CHARACTERS]
     # A date may be several words, and a number of seconds is one.
     is_date = file.value("timeformat", "epsec") in DATES
     if not time_words or (len(time_words) > 1 and not is_date):
         raise AemFaultError(where, f"{quoted!r}: {wanted}")
     try:
-        file.rows.append([float(word) for word in words[len(time_words) :]])
+        file.rows.append([float(word) for word in fields[len(time_words) :]])
     except ValueError:
         raise AemFaultError(where, f"{quoted!r}: {wanted}") from None
     file.times.append(" ".join(time_words))
@@ -290,11 +293,10 @@ def _scalar_of(file: _StkFile) -> str:
 
 def _axes(file: _StkFile) -> str:
     """CoordinateAxes by an AEM's name. Raises AemFaultError."""
-    axes, body = file.value("coordinateaxes"), file.value("centralbody", "earth")
-    where, known = (
-        file.lines.get("coordinateaxes", ""),
-        "J2000, ICRF, Inertial, Fixed, MeanOfDate, TrueOfDate or TEMEOfDate",
-    )
+    axes = file.value("coordinateaxes")
+    body = file.value("centralbody", "earth")
+    where = file.lines.get("coordinateaxes", "")
+    known = "J2000, ICRF, Inertial, Fixed, MeanOfDate, TrueOfDate or TEMEOfDate"
     if not axes:
         raise AemFaultError("", f"states no CoordinateAxes; write CoordinateAxes and {known}")
     if axes not in AXES:
@@ -375,7 +377,9 @@ def _conventions(conventions: Conventions, file: _StkFile) -> Conventions:
         scalar=f"{scalar}, the conjugate of a Hamilton quaternion",
     )
     dated = "scenarioepoch" in file.keywords or file.value("timeformat") in DATES
-    return named if dated else replace(named, time=NO_DATE, scale=None)
+    if dated:
+        return named
+    return replace(named, time=NO_DATE, scale=None)
 
 
 log_format = LogFormat(

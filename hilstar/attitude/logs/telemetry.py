@@ -58,9 +58,10 @@ def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
         valid = np.ones(len(samples), dtype=np.bool_)
         telemetry = Telemetry(path, t_ns, q, valid, np.arange(1, len(samples) + 1), of_lines=False)
     if not telemetry.valid.any():
-        rows = (
-            f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
-        )
+        if len(telemetry.t_ns):
+            rows = f"{len(telemetry.t_ns)} rows, none of them valid"
+        else:
+            rows = "no row"
         raise InputError(f"{path}: has {rows}; {ADVICE}")
     return telemetry
 
@@ -73,23 +74,23 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
     for number, cells in read_rows(path, COLUMNS, ADVICE, MAX_BYTES, keep_cut=False):
         t_ns.append(_time(path, number, cells[0]))
         if rising and len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
-            said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
+            fault = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
             raise InputError(
-                f"{path}:{number}: time does not increase ({said}); sort the rows, and give one"
+                f"{path}:{number}: time does not increase ({fault}); sort the rows, and give one"
                 " recording"
             )
         valid.append(is_valid(path, number, cells[5]))
-        own = [math.nan] * 4
+        own_q = [math.nan] * 4
         if valid[-1]:
-            own = finite_numbers(
+            own_q = finite_numbers(
                 path, number, COLUMNS[1:], cells[1:5], "write valid = 0 where there is no answer"
             )
-            if abs(math.hypot(*own) - 1) > NORM_TOLERANCE:
-                said = f"the norm of qw,qx,qy,qz is {math.hypot(*own):.6g}"
+            if abs(math.hypot(*own_q) - 1) > NORM_TOLERANCE:
+                fault = f"the norm of qw,qx,qy,qz is {math.hypot(*own_q):.6g}"
                 raise InputError(
-                    f"{path}:{number}: {said}; write unit quaternions, within {NORM_TOLERANCE:g}"
+                    f"{path}:{number}: {fault}; write unit quaternions, within {NORM_TOLERANCE:g}"
                 )
-        q.append(own)
+        q.append(own_q)
         line.append(number)
         if len(t_ns) > MAX_ROWS:
             raise InputError(f"{path}: more than {MAX_ROWS} rows; give a shorter recording")

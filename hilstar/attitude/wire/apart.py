@@ -159,21 +159,30 @@ class ReaderProcess:
         clock: HostClock = HOST_CLOCK,
         name: str = "the attitude receiver",
     ) -> None:
-        self.generation, self._name = 0, name
-        self._notices, self._module, self._clock = notices, module, clock
-        self._order, self._file = ReadOrder(0), -1
+        self.generation = 0
+        self._name = name
+        self._notices = notices
+        self._module = module
+        self._clock = clock
+        self._order = ReadOrder(0)
+        self._file = -1
         self._process: subprocess.Popen[bytes] | None = None
         self._wire: socket.socket | None = None
         self._stream = RecordStream()
-        self._why, self._ready = "", False
-        self._silent_s, self._looked_ns, self._busy_from_s = 0.0, clock.now_ns(), math.nan
+        self._why = ""
+        self._ready = False
+        self._silent_s = 0.0
+        self._looked_ns = clock.now_ns()
+        self._busy_from_s = math.nan
         self._trouble = ""
         self._again = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         self._begin()
 
     def _begin(self) -> None:
         self.generation += 1
-        self._steady, self._why, self._stream = self._clock.within(STEADY_S), "", RecordStream()
+        self._steady = self._clock.within(STEADY_S)
+        self._why = ""
+        self._stream = RecordStream()
         self._ready, self._silent_s, self._looked_ns = False, 0.0, self._clock.now_ns()
         self._opened, self._busy_from_s = 0, math.nan  # the number of the order that it carries out
         wire, its_wire = socket.socketpair()
@@ -228,17 +237,18 @@ class ReaderProcess:
             return False
         poll = select.poll()
         poll.register(self._wire, select.POLLIN)
-        said = bool(poll.poll(timeout_ms))
+        is_heard = bool(poll.poll(timeout_ms))
         now_ns = self._clock.now_ns()
-        passed_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
+        passed_s = (now_ns - self._looked_ns) / NS_PER_S
+        self._looked_ns = now_ns
         self._silent_s = (
-            0.0 if said else self._silent_s + min(passed_s, max(timeout_ms / 1000, MAX_LOOK_S))
+            0.0 if is_heard else self._silent_s + min(passed_s, max(timeout_ms / 1000, MAX_LOOK_S))
         )
         if self._silent_s > (STARTS_S if self._starting else HUNG_S):
             self._look_closely()
         else:
             self._busy_from_s = math.nan
-        return said
+        return is_heard
 
     def _look_closely(self) -> None:
         """End a process that is silent, unless it may be waiting for a core."""
@@ -249,7 +259,12 @@ class ReaderProcess:
         if not self._starting and state == "R" and used_s > LOOPS_S:
             self._ended(f"it took {used_s:.1f} s of a core over one message, and did not return")
         elif self._starting or state != "R" or self._silent_s > STALLED_S:
-            limit_s = STARTS_S if self._starting else STALLED_S if state == "R" else HUNG_S
+            if self._starting:
+                limit_s = STARTS_S
+            elif state == "R":
+                limit_s = STALLED_S
+            else:
+                limit_s = HUNG_S
             self._ended(f"no sign of life for {limit_s:g} s")
 
     def _state(self) -> tuple[str, float]:
@@ -324,10 +339,12 @@ class ReaderProcess:
         self._notices.tell("receiver-failed", f"{self._name} stopped ({why}); restarting it")
 
     def _stop(self, patience_s: float) -> int:
-        wire, self._wire = self._wire, None
+        wire = self._wire
+        self._wire = None
         if wire is not None:
             wire.close()
-        process, self._process = self._process, None
+        process = self._process
+        self._process = None
         if process is None:
             return 0
         try:

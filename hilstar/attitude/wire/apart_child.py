@@ -32,7 +32,8 @@ class Wire:
     """This end of the socket pair; a peer that is gone raises EOFError."""
 
     def __init__(self, made: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
-        self._socket, self._clock = made, clock
+        self._socket = made
+        self._clock = clock
         self._next_sign = clock.within(0.0)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WANTED_BUFFER_BYTES)
         self._poll = select.poll()
@@ -57,23 +58,25 @@ class Wire:
         """The newest order, if there is one within the time, and the device's descriptor."""
         if not self._poll.poll(timeout_ms):
             return None
-        said, files = b"", [-1]
+        order_bytes = b""
+        files = [-1]
         try:
-            while not said.endswith(b"\n"):
+            while not order_bytes.endswith(b"\n"):
                 more, files, _, _ = socket.recv_fds(self._socket, MAX_ORDER_BYTES, 1)
                 if not more:
                     raise EOFError
-                said += more
+                order_bytes += more
         except OSError as error:
             raise EOFError from error
-        newest: ReadOrder = pickle.loads(bytes.fromhex(said.splitlines()[-1].decode()))
+        newest: ReadOrder = pickle.loads(bytes.fromhex(order_bytes.splitlines()[-1].decode()))
         return newest, files[0] if newest.device and files else None
 
 
 class _OpenDevice:
     def __init__(self, file: int, clock: HostClock = HOST_CLOCK) -> None:
         self.link_counts = LinkCounts()
-        self._file, self._clock = file, clock
+        self._file = file
+        self._clock = clock
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         return bool(select.select([self._file], [], [], timeout_ms / 1000)[0])
@@ -98,10 +101,13 @@ class _ForwardedNotices(Notices):
     def __init__(self, wire: Wire, order: int) -> None:
         super().__init__()
         self.link_counts = LinkCounts()  # the link's own, as soon as there is one
-        self._wire, self._order, self._counted = wire, order, LinkCounts()
+        self._wire = wire
+        self._order = order
+        self._counted = LinkCounts()
 
     def count(self) -> None:
-        grown, self._counted = self.link_counts - self._counted, replace(self.link_counts)
+        grown = self.link_counts - self._counted
+        self._counted = replace(self.link_counts)
         if grown != LinkCounts():
             self._wire.put(Record(self._order, counts=grown))
 
@@ -128,7 +134,9 @@ class _Reading:
     def __init__(
         self, wire: Wire, order: ReadOrder, file: int | None, clock: HostClock = HOST_CLOCK
     ) -> None:
-        self._wire, self._number, self._clock = wire, order.number, clock
+        self._wire = wire
+        self._number = order.number
+        self._clock = clock
         self._notices = _ForwardedNotices(wire, order.number)
         self._empty_ns = clock.now_ns()
         self.link: RawLink | None = None
@@ -198,7 +206,10 @@ def main() -> NoReturn:
         pass
     except BaseException as error:
         code = 1
-        why = str(error) if isinstance(error, HilstarError) else f"{type(error).__name__}: {error}"
+        if isinstance(error, HilstarError):
+            why = str(error)
+        else:
+            why = f"{type(error).__name__}: {error}"
         with contextlib.suppress(EOFError):
             wire.put(Record(end=one_line(why)))
     os._exit(code)  # threads of libraries are not waited for

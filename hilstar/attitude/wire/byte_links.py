@@ -53,8 +53,10 @@ class ByteLink(Closing):
     messages = False
 
     def __init__(self, endpoint: str, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self.endpoint, self.link_counts = endpoint, LinkCounts()
-        self._notices, self._clock = notices, clock
+        self.endpoint = endpoint
+        self.link_counts = LinkCounts()
+        self._notices = notices
+        self._clock = clock
         self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
 
     def trouble(self) -> str:
@@ -99,7 +101,8 @@ class SerialBytes(ByteLink):
         self, port: str, baud: int, notices: Notices, clock: HostClock = HOST_CLOCK
     ) -> None:
         super().__init__(f"serial:{port}@{baud}", notices, clock)
-        self._port, self._baud = port, baud
+        self._port = port
+        self._baud = baud
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:
@@ -141,7 +144,8 @@ class SerialBytes(ByteLink):
 
     def close(self) -> None:
         """Close the port."""
-        device, self._device = self._device, None
+        device = self._device
+        self._device = None
         if device is not None:
             with contextlib.suppress(*LOST):
                 device.close()
@@ -184,19 +188,19 @@ class UdpBytes(ByteLink):
         """See `ByteLink.taken`."""
         if not self._datagrams.wait(timeout_ms):
             return []
-        found = []
+        chunks = []
         for datagram in self._datagrams.take(MAX_DATAGRAMS):
             host = (datagram.sender or ("",))[0]
             if self._allowed is None or self._allowed.admits(host):
-                found.append(datagram)
+                chunks.append(datagram)
                 continue
             self.link_counts.rejected += 1
-            said = (
+            notice = (
                 f"datagrams from {host} are dropped: it is not in [answers] allow; further ones are"
                 " only counted"
             )
-            self._notices.begin("sender-not-allowed", said)
-        return found
+            self._notices.begin("sender-not-allowed", notice)
+        return chunks
 
     def put(self, data: bytes) -> None:
         """See `ByteLink.put`."""
@@ -225,21 +229,27 @@ class TcpBytes(ByteLink):
     ) -> None:
         host, port = (str(place.host), place.port) if isinstance(place, UdpPlace) else place
         super().__init__(f"tcp://{f'[{host}]' if ':' in host else host}:{port}", notices, clock)
-        self._place, self._allowed = (host, port), allowed
+        self._place = (host, port)
+        self._allowed = allowed
         self._listener = self._connection = None
-        self._peer, self._refused = "", ""
-        self._holds, self._told = clock.within(0.0), clock.within(0.0)
+        self._peer = ""
+        self._refused = ""
+        self._holds = clock.within(0.0)
+        self._told = clock.within(0.0)
         self._accepts = clock.within(0.0)
         if isinstance(place, UdpPlace):
             try:
-                family = socket.AF_INET6 if place.host.version == 6 else socket.AF_INET
+                if place.host.version == 6:
+                    family = socket.AF_INET6
+                else:
+                    family = socket.AF_INET
                 self._listener = socket.create_server((host, port), family=family)
             except OSError as error:
-                said = (
+                refusal = (
                     f"cannot listen ({error.strerror}); write an address of this machine and a free"
                     " port"
                 )
-                raise InputError(f"[answers] listen: {self.endpoint}: {said}") from error
+                raise InputError(f"[answers] listen: {self.endpoint}: {refusal}") from error
             self._listener.setblocking(False)
 
     _listener: socket.socket | None
@@ -251,14 +261,20 @@ class TcpBytes(ByteLink):
             if not self._retry.over:
                 return self._rest(timeout_ms)
             self._connect()
-        waited_for = self._listener if self._accepts.over else None
+        if self._accepts.over:
+            waited_for = self._listener
+        else:
+            waited_for = None
         ends = [end for end in (waited_for, self._connection) if end is not None]
         if not ends:  # a connection was refused a moment ago
             self._clock.sleep(min(self._accepts.left_s, timeout_ms / 1000))
             return []
         ready = select.select(ends, [], [], timeout_ms / 1000)[0]
         # The tracker's own bytes first: they hold the line, and its end lets a new connection in.
-        chunks = self._read(self._connection) if self._connection in ready else []
+        if self._connection in ready:
+            chunks = self._read(self._connection)
+        else:
+            chunks = []
         if self._listener in ready:
             self._accept()
         return chunks
@@ -354,7 +370,8 @@ class ZmqBytes(ByteLink):
         self, receiver: ZmqReceiver, notices: Notices, clock: HostClock = HOST_CLOCK
     ) -> None:
         super().__init__(receiver.endpoint, notices, clock)
-        self._receiver, self.link_counts = receiver, receiver.link_counts
+        self._receiver = receiver
+        self.link_counts = receiver.link_counts
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         """See `ByteLink.taken`."""
@@ -370,7 +387,9 @@ class ZmqBytes(ByteLink):
 
 def no_file_kind(mode: int) -> str:
     """What a file's mode says that it is, "" for a regular file."""
-    return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")
+    if stat.S_ISREG(mode):
+        return ""
+    return KINDS.get(stat.S_IFMT(mode), "no file")
 
 
 def refuse_no_file(path: Path) -> None:
@@ -398,7 +417,9 @@ class FileBytes(ByteLink):
 
     def __init__(self, path: Path, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         super().__init__(str(path), notices, clock)
-        self._path, self._file, self._trouble = path, -1, ""
+        self._path = path
+        self._file = -1
+        self._trouble = ""
         self._follow()
         if self._file >= 0:
             os.lseek(self._file, 0, os.SEEK_END)
@@ -415,15 +436,16 @@ class FileBytes(ByteLink):
             os.close(file)
             self._let_go(kind)
             return
-        self._file, self._trouble = file, ""
+        self._file = file
+        self._trouble = ""
         self._opened()
 
     def _let_go(self, kind: str) -> None:
         self.close()
-        said = f"it is {kind} now, and no regular file"
-        if self._trouble != said:
-            self._trouble = said
-            self._lose(said)
+        trouble = f"it is {kind} now, and no regular file"
+        if self._trouble != trouble:
+            self._trouble = trouble
+            self._lose(trouble)
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         """See `ByteLink.taken`."""

@@ -181,7 +181,10 @@ class UdpPlace:
         return self.host.is_loopback
 
     def __str__(self) -> str:
-        host = f"[{self.host}]" if self.host.version == 6 else str(self.host)
+        if self.host.version == 6:
+            host = f"[{self.host}]"
+        else:
+            host = str(self.host)
         return f"udp://{host}:{self.port}"
 
 
@@ -227,11 +230,11 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
         raise InputError(
             f"bind = false: over UDP hilstar binds and the simulator sends to it; {BIND_FORM}"
         )
-    said: dict[str, tuple[str | None, int | None]] = {}
+    places: dict[str, tuple[str | None, int | None]] = {}
     if isinstance(bind, str):
-        said[f'bind = "{shortened(bind)}"'] = _parts(bind, f'bind = "{shortened(bind)}"')
+        places[f'bind = "{shortened(bind)}"'] = _parts(bind, f'bind = "{shortened(bind)}"')
     if port != "":
-        said[f"port = {port!r}"] = (None, _port(str(port), f"port = {shortened(str(port))}"))
+        places[f"port = {port!r}"] = (None, _port(str(port), f"port = {shortened(str(port))}"))
     if endpoint is not None:
         word = f'endpoint = "{shortened(endpoint)}"'
         if not endpoint.startswith("udp://"):
@@ -239,11 +242,11 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
                 f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or"
                 f" {BIND_FORM.removeprefix('write ')}"
             )
-        said[word] = _parts(endpoint.removeprefix("udp://"), word)
-    hosts = {word: host for word, (host, _) in said.items() if host is not None} or {
+        places[word] = _parts(endpoint.removeprefix("udp://"), word)
+    hosts = {word: host for word, (host, _) in places.items() if host is not None} or {
         "": DEFAULT_HOST
     }
-    ports = {word: number for word, (_, number) in said.items() if number is not None} or {
+    ports = {word: number for word, (_, number) in places.items() if number is not None} or {
         "": DEFAULT_PORT
     }
     for values in (hosts, ports):
@@ -255,11 +258,13 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
 
 
 def _parts(text: str, word: str) -> tuple[str, int | None]:
-    text = f"[{text}]" if text.count(":") > 1 and not text.startswith("[") else text
+    if text.count(":") > 1 and not text.startswith("["):
+        text = f"[{text}]"
     match = PLACE.fullmatch(text)
     if match is None:
         raise InputError(f"{word}: not an address and a port; {BIND_FORM}")
-    host, port = match["six"] or match["host"], match["port"]
+    host = match["six"] or match["host"]
+    port = match["port"]
     try:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError as error:

@@ -171,10 +171,11 @@ class AllowList:
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Whether a client with this public key (Z85) may connect."""
-        seen = self._look()
-        if seen != self._seen:
-            self._seen, self._keys = seen, set()
-            for path in seen:
+        file_stamps = self._look()
+        if file_stamps != self._seen:
+            self._seen = file_stamps
+            self._keys = set()
+            for path in file_stamps:
                 try:
                     self._keys.add(load_public(path))
                 except InputError as error:
@@ -183,9 +184,9 @@ class AllowList:
 
     def _look(self) -> dict[Path, tuple[int, int, int]]:
         """Each key file, with what changes when it is written or replaced."""
-        found = {}
+        file_stamps = {}
         with contextlib.suppress(OSError):
             for path in sorted(self._directory.glob("*.key")):
                 status = path.stat()
-                found[path] = (status.st_mtime_ns, status.st_size, status.st_ino)
-        return found
+                file_stamps[path] = (status.st_mtime_ns, status.st_size, status.st_ino)
+        return file_stamps

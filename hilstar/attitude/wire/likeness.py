@@ -66,26 +66,27 @@ class Likeness(NamedTuple):
 
 def likeness(data: bytes) -> Likeness:
     """What a message, or the beginning of a stream, looks like."""
-    seen = data[:MAX_LOOKED_AT]
+    beginning = data[:MAX_LOOKED_AT]
     for kind in (_protocol, _packet_inside, _serialised, _text):
-        found = kind(seen)
-        if found is not None:
-            return found
-    if not seen:
+        likely = kind(beginning)
+        if likely is not None:
+            return likely
+    if not beginning:
         return Likeness("nothing", known=False)
-    if len(set(seen)) == 1 and len(seen) >= MIN_TEXT_BYTES:
+    if len(set(beginning)) == 1 and len(beginning) >= MIN_TEXT_BYTES:
         return Likeness(
-            f"the byte 0x{seen[0]:02x} {len(seen)} times",
+            f"the byte 0x{beginning[0]:02x} {len(beginning)} times",
             "check the line's polarity, ground and baud rate",
         )
-    return Likeness(f"binary, {_in_hex(seen)}", known=False)
+    return Likeness(f"binary, {_in_hex(beginning)}", known=False)
 
 
 def packet_likeness(message: bytes) -> Likeness | None:
     """What is wrong with a packet whose CRC-32 does not fit, where that can be known; None where
     it cannot.
     """
-    body, given = message[:-CRC_BYTES], message[-CRC_BYTES:]
+    body = message[:-CRC_BYTES]
+    given = message[-CRC_BYTES:]
     crc = zlib.crc32(body)
     if given == crc.to_bytes(CRC_BYTES, "big"):
         if (
@@ -118,8 +119,10 @@ def _telling(message: bytes) -> Likeness | None:
     """The likeness of a message that is something else altogether; None for a packet that was
     damaged on its way.
     """
-    found = likeness(message)
-    return found if found.known and message[: len(HEAD)] != HEAD else None
+    likely = likeness(message)
+    if likely.known and message[: len(HEAD)] != HEAD:
+        return likely
+    return None
 
 
 def _big_endian_numbers(message: bytes) -> Likeness | None:
@@ -152,12 +155,12 @@ def _other_crc(body: bytes, given: int) -> str:
     significant bit first.
     """
     forward = _unreflected(body)
-    words = b"".join(body[at : at + CRC_BYTES][::-1] for at in range(0, len(body), CRC_BYTES))
+    swapped = b"".join(body[at : at + CRC_BYTES][::-1] for at in range(0, len(body), CRC_BYTES))
     names = {
         zlib.crc32(body) ^ ALL_ONES: "CRC-32/JAMCRC, which lacks the last inversion",
         forward: "CRC-32/BZIP2, whose bits are in the other order",
         forward ^ ALL_ONES: "CRC-32/MPEG-2, whose bits are in the other order",
-        _unreflected(words)
+        _unreflected(swapped)
         ^ ALL_ONES: "that of an STM32's CRC unit as it starts: CRC-32/MPEG-2 of 32-bit words",
     }
     return names.get(given, "")
@@ -223,7 +226,10 @@ def unframed_packet(data: bytes) -> Likeness | None:
     for at in range(len(data) - protocol.ATTITUDE_BYTES + 1):
         message = data[at : at + protocol.ATTITUDE_BYTES]
         if message.startswith(HEAD) and _crc_fits(message):
-            what = "a packet in SLIP" if data[max(at - 1, 0)] == SLIP_END else "a bare packet"
+            if data[max(at - 1, 0)] == SLIP_END:
+                what = "a packet in SLIP"
+            else:
+                what = "a bare packet"
             return Likeness(what, "send each as a COBS frame, followed by 0x00")
     return None
 
@@ -249,7 +255,10 @@ def _beside_a_frame(before: bytes, after: bytes) -> Likeness:
         return Likeness(
             "COBS frames without an end", "send 0x00 after each, which COBS libraries do not add"
         )
-    what = "a line end" if before.isspace() else f"{likeness(before).what}, stands"
+    if before.isspace():
+        what = "a line end"
+    else:
+        what = f"{likeness(before).what}, stands"
     return Likeness(
         f"{what} before a frame", "send nothing between one frame's 0x00 and the next frame"
     )
@@ -317,7 +326,8 @@ def _is_utf8(text: bytes) -> bool:
 
 
 def _kind_of_text(text: bytes) -> Likeness:
-    start, quoted = text.lstrip()[:1], _quoted(text)
+    start = text.lstrip()[:1]
+    quoted = _quoted(text)
     if start == b"[":
         return Likeness(f"a JSON array, {quoted}", "send one object for each attitude")
     if start == b"{":

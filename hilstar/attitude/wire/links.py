@@ -66,7 +66,9 @@ class FloodGate:
     """
 
     def __init__(self, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self._counts, self._notices, self._clock = counts, notices, clock
+        self._counts = counts
+        self._notices = notices
+        self._clock = clock
         self._left = float(MAX_BURST)
         self._seen_ns = clock.now_ns()
         self._dropped_ns = self._seen_ns - OVER_NS - 1
@@ -175,7 +177,8 @@ class Link(Closing, ABC):
     conventions: Conventions = PACKETS
 
     def __init__(self, notices: Notices | None, clock: HostClock) -> None:
-        self._notices, self._clock = Notices() if notices is None else notices, clock
+        self._notices = Notices() if notices is None else notices
+        self._clock = clock
         self.link_counts = LinkCounts()
         self._gate = FloodGate(self.link_counts, self._notices, clock)
 
@@ -188,12 +191,15 @@ class Link(Closing, ABC):
         """Why the other side gives no messages, as far as that shows: a line; "" where it does
         not.
         """
-        counts, wrong_peer = self.link_counts, self._notices.latest(WRONG_PEER)
+        counts = self.link_counts
+        wrong_peer = self._notices.latest(WRONG_PEER)
         if wrong_peer:
             return "" if counts.connections else wrong_peer
         # who binds counts connections from their begin on, so also those that it then rejects
         is_alone = counts.connections <= counts.rejected
-        return self._notices.latest(CLIENT_REJECTED) if is_alone else ""
+        if is_alone:
+            return self._notices.latest(CLIENT_REJECTED)
+        return ""
 
     def await_ready(self) -> None:
         """Wait until a sender is heard from the first read on: for a process that reads, and not
@@ -210,7 +216,9 @@ class StreamLink(Link):
     @property
     def reconnects(self) -> int:
         """How often the sender came back."""
-        return 0 if self.bound else max(0, self.link_counts.connections - 1)
+        if self.bound:
+            return 0
+        return max(0, self.link_counts.connections - 1)
 
     @abstractmethod
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:

@@ -102,7 +102,8 @@ class MessageSplitter:
                 overlong = self._overlong or end.end() > MAX_MESSAGE_BYTES
                 messages.append(TOO_LONG if overlong else bytes(self._kept[: end.end()]))
                 del self._kept[: end.end()]
-                self._line, self._overlong = 0, False
+                self._line = 0
+                self._overlong = False
             self._line = self._kept.rfind(b"\n") + 1
         if len(self._kept) > MAX_MESSAGE_BYTES:
             # The last line may be the beginning of the end.
@@ -139,21 +140,24 @@ class MessageReader:
         if t_ns is None:
             return Refusal("format", f"no TIME YYYY-DDD-hh:mm:ss, but {text[:SHOWN_CHARACTERS]!r}")
         try:
-            found = {
-                name: tuple(map(float, values.split())) for name, values in self._line.findall(text)
-            }
+            fields = {}
+            for name, values in self._line.findall(text):
+                fields[name] = tuple(map(float, values.split()))
         except ValueError:
-            found = {"qn": ()}
-        if "qn" not in found:
+            fields = {"qn": ()}
+        if "qn" not in fields:
             return Refusal(
                 "format", f'no {self._name}.qn; write the prefix "{self._name}" in Inp_IPC.txt'
             )
-        q, rate = found["qn"], found.get("wn", ())
+        q = fields["qn"]
+        rate = fields.get("wn", ())
         if len(q) != 4 or len(rate) not in {0, 3}:
             return Refusal("format", f"{self._name}.qn must have four numbers, and wn three")
         x, y, z, w = q
         body = checked_sample(t_ns, (w, -x, -y, -z), tuple(rate) or None, self._sequence)
-        return body if isinstance(body, Refusal) else self._mounting.sample(body)
+        if isinstance(body, Refusal):
+            return body
+        return self._mounting.sample(body)
 
 
 def _time_ns(text: str) -> int | None:
@@ -194,13 +198,15 @@ class _Connection(Link):
             raise InputError(
                 f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001"
             )
-        self.endpoint, self.verb = endpoint, "bound to" if bind else "connecting to"
+        self.endpoint = endpoint
+        self.verb = "bound to" if bind else "connecting to"
         host, _, port = place.address.removeprefix("tcp://").rpartition(":")
         self._place = (
             "0.0.0.0" if host == "*" else host.strip("[]"),
             0 if port == "*" else int(port),
         )
-        self._reader, self._splitter = reader, MessageSplitter()
+        self._reader = reader
+        self._splitter = MessageSplitter()
         self._allowed = AllowedSenders() if allowed is None else allowed
         self._connection: socket.socket | None = None
         self._retry = clock.within(0.0)
@@ -306,12 +312,16 @@ class _Connection(Link):
             self._notices.tell("back", "42 is connected again")
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        waited = [each for each in (self._listener, self._connection) if each is not None]
+        waited = [
+            waiting_socket
+            for waiting_socket in (self._listener, self._connection)
+            if waiting_socket is not None
+        ]
         if not waited:
             return False
         poll = select.poll()
-        for each in waited:
-            poll.register(each, select.POLLIN)
+        for waiting_socket in waited:
+            poll.register(waiting_socket, select.POLLIN)
         asked_ns = self._clock.now_ns()
         waits = bool(poll.poll(timeout_ms))
         if not waits and self._connection is not None:
@@ -319,7 +329,8 @@ class _Connection(Link):
         return waits
 
     def _shut(self) -> None:
-        connection, self._connection = self._connection, None
+        connection = self._connection
+        self._connection = None
         if connection is not None:
             connection.close()
 

@@ -228,15 +228,22 @@ def decode(message: bytes) -> Event:
 
 def _decode_packet(message: bytes, form: str) -> Event:
     """Decode a packet's bytes; `form` is what is expected on its road."""
-    head = (message[0], message[1]) if len(message) > 1 else (-1, -1)
-    size = protocol.PACKET_BYTES.get(head[1]) if head[0] == VERSION else None
+    if len(message) > 1:
+        head = (message[0], message[1])
+    else:
+        head = (-1, -1)
+    if head[0] == VERSION:
+        size = protocol.PACKET_BYTES.get(head[1])
+    else:
+        size = None
     if len(message) not in {size, protocol.ATTITUDE_BYTES}:
         return named_refusal("format", f"{len(message)} bytes", likeness(message), form)
     if CRC.unpack_from(message, len(message) - CRC.size)[0] != zlib.crc32(message[: -CRC.size]):
-        detail, found = "the CRC-32 does not match the packet", packet_likeness(message)
-        return (
-            Refusal("crc", detail) if found is None else named_refusal("crc", detail, found, form)
-        )
+        detail = "the CRC-32 does not match the packet"
+        likely = packet_likeness(message)
+        if likely is None:
+            return Refusal("crc", detail)
+        return named_refusal("crc", detail, likely, form)
     if len(message) != size:
         return Refusal(
             "format", f"version {head[0]}, kind {head[1]}; send version {VERSION}, kind 1"
@@ -276,13 +283,16 @@ def _decode_body(kind: int, message: bytes) -> Event:
             sequence, flags, t_ns, tuple(numbers[:4]), tuple(numbers[4:7]), numbers[7]
         )
     _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
-    known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
+    if flags & protocol.FLAG_RATE_VALID:
+        known_rate = tuple(rate)
+    else:
+        known_rate = None
     discontinuity = bool(flags & protocol.FLAG_DISCONTINUITY)
     number = flags >> protocol.SENDER_FIRST_BIT
     sender = 0 if number == UNSTATED_SENDER else number
     event = checked_sample(t_ns, (w, x, y, z), known_rate, sequence, discontinuity, sender)
-    if isinstance(event, Refusal) and (found := numbers_likeness(message)) is not None:
-        return named_refusal(event.reason, event.detail, found, MESSAGE_FORM)
+    if isinstance(event, Refusal) and (likely := numbers_likeness(message)) is not None:
+        return named_refusal(event.reason, event.detail, likely, MESSAGE_FORM)
     return event
 
 
@@ -360,7 +370,10 @@ def _decode_json(message: bytes) -> AttitudeSample | Refusal:
         if b"NaN" in message or b"Infinity" in message:
             return Refusal("nan", "a number is NaN or Infinity", unset=b"NaN" in message)
         return Refusal("format", f"{error}; write {JSON_FORM}")
-    sender = form.sender if form.sender != UNSTATED_SENDER else 0
+    if form.sender != UNSTATED_SENDER:
+        sender = form.sender
+    else:
+        sender = 0
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity, sender)
 
 
@@ -398,20 +411,23 @@ class StreamDecoder:
         beginning, once.
         """
         first, *others = chunk.split(DELIMITER)
-        found: list[bytes] = []
-        self._keep(first, found)
+        whole_frames: list[bytes] = []
+        self._keep(first, whole_frames)
         if not others:
-            return found
-        body, overlong, whole = bytes(self._kept), self._overlong, self._synchronised
+            return whole_frames
+        body = bytes(self._kept)
+        overlong = self._overlong
+        whole = self._synchronised
         self._kept.clear()
-        self._overlong, self._synchronised = False, True
+        self._overlong = False
+        self._synchronised = True
         whole = whole or len(body) > MAX_FRAME_BYTES
         if body and not overlong and (whole or not isinstance(decode_frame(body), Refusal)):
-            found.append(body)
+            whole_frames.append(body)
         rest = others.pop()
-        found += [frame[: MAX_KEPT_BYTES + 1] for frame in others if frame]
-        self._keep(rest, found)
-        return found
+        whole_frames += [frame[: MAX_KEPT_BYTES + 1] for frame in others if frame]
+        self._keep(rest, whole_frames)
+        return whole_frames
 
     def _keep(self, part: bytes, found: list[bytes]) -> None:
         if self._overlong:
@@ -448,17 +464,17 @@ def decode_frame(body: bytes) -> Event:
     if (
         isinstance(event, Refusal)
         and event.reason == "format"
-        and (found := frame_likeness(body)).known
+        and (likely := frame_likeness(body)).known
     ):
-        return named_refusal("format", f"{len(message)} bytes", found, FRAME_FORM)
+        return named_refusal("format", f"{len(message)} bytes", likely, FRAME_FORM)
     return event
 
 
 def unended_line(data: bytes) -> str:
     """Why bytes of a serial line gave no packet, though no frame of theirs has ended."""
-    found = frame_likeness(data)
+    likely = frame_likeness(data)
     return (
-        f"{len(data)} bytes came, and no frame ended: {found.what}; {found.instead or FRAME_FORM}"
+        f"{len(data)} bytes came, and no frame ended: {likely.what}; {likely.instead or FRAME_FORM}"
     )
 
 

@@ -64,17 +64,16 @@ def adapters() -> list[str]:
     (0403:6001)".
     """
     ports = sorted(list_ports.comports())
-    words = [
-        (
+    lines = []
+    for port in ports:
+        lines.append(
             f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
             if port.vid is not None
             else "UART"
         )
-        for port in ports
-    ]
     return [
-        f"{words.count(word)} x {word}" if words.count(word) > 1 else word
-        for word in dict.fromkeys(words)
+        f"{lines.count(word)} x {word}" if lines.count(word) > 1 else word
+        for word in dict.fromkeys(lines)
     ]
 
 
@@ -107,11 +106,14 @@ class SerialLink(StreamLink):
         sent: SentAttitudes = AS_SENT,
     ) -> None:
         super().__init__(notices, clock)
-        self.conventions, self._decode = sent.conventions, sent.decoder(wire.decode_frame)
+        self.conventions = sent.conventions
+        self._decode = sent.decoder(wire.decode_frame)
         self.endpoint = f"serial:{port}@{baud}"
-        self._port, self._baud = port, baud
+        self._port = port
+        self._baud = baud
         self._reopened = 0
-        self._decoder, self._recent = wire.StreamDecoder(), b""
+        self._decoder = wire.StreamDecoder()
+        self._recent = b""
         self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         try:
             self._device: serial.Serial | None = self._open()
@@ -127,7 +129,9 @@ class SerialLink(StreamLink):
     def trouble(self) -> str:
         """See `Link.trouble`: the bytes that came, and are no frame."""
         unended = self._decoder.unended
-        return f"{self.endpoint}: {wire.unended_line(unended)}" if unended else ""
+        if unended:
+            return f"{self.endpoint}: {wire.unended_line(unended)}"
+        return ""
 
     def _open(self) -> serial.Serial:
         self._decoder = wire.StreamDecoder()
@@ -170,11 +174,9 @@ class SerialLink(StreamLink):
         if not isinstance(event, wire.Refusal) or event.reason != "format":
             return event
         unframed = unframed_packet(self._recent)
-        return (
-            event
-            if unframed is None
-            else wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
-        )
+        if unframed is None:
+            return event
+        return wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
@@ -182,7 +184,9 @@ class SerialLink(StreamLink):
         data = device.read(1)
         data += device.read(min(device.in_waiting, MAX_READ_BYTES)) if data else b""
         now_ns = self._clock.now_ns()
-        return [RawMessage(now_ns, [data], now_ns)] if data else []
+        if data:
+            return [RawMessage(now_ns, [data], now_ns)]
+        return []
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once unread bytes wait."""
@@ -257,7 +261,8 @@ class SerialLink(StreamLink):
         self.send_bytes(wire.DELIMITER)
 
     def _shut(self) -> None:
-        device, self._device = self._device, None
+        device = self._device
+        self._device = None
         if device is not None:
             with contextlib.suppress(OSError, TypeError):
                 device.close()
@@ -298,7 +303,10 @@ class SerialApart(SerialLink):
         if self._given is not device:
             self._given = device
             self._reader.read(device=device.fileno())
-        records = self._reader.take() if self._reader.wait(timeout_ms) else []
+        if self._reader.wait(timeout_ms):
+            records = self._reader.take()
+        else:
+            records = []
         for record in records:
             if record.gone is not None:
                 self._lose(record.gone)
@@ -370,7 +378,8 @@ def read_lines(
         raise opening_refusal(name, error, port) from error
     with device:
         device.reset_input_buffer()
-        end, line = clock.within(seconds), b""
+        end = clock.within(seconds)
+        line = b""
         while not end.over:
             try:
                 byte = device.read(1)
@@ -437,7 +446,8 @@ class RtsLine:
 
     def close(self) -> None:
         """Close the port with the line at rest."""
-        device, self._device = self._device, None
+        device = self._device
+        self._device = None
         if device is not None:
             with contextlib.suppress(*LOST):
                 device.rts = not self._active_high

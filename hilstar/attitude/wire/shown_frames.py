@@ -67,7 +67,9 @@ class ShownFrame:
     @property
     def q_icrs_to_cam(self) -> FloatArray | None:
         """Its attitude (4,), unit; None where it is blank."""
-        return None if self.head.q is None else np.array(self.head.q)
+        if self.head.q is None:
+            return None
+        return np.array(self.head.q)
 
 
 _heads = msgspec.json.Decoder(FrameHead)
@@ -136,15 +138,16 @@ class FrameSender(ZmqSender):
             self._keeper.left.clear()
         for _ in range(MAX_READ):
             try:
-                said = self._ready().recv(zmq.NOBLOCK, copy=False)
+                subscription = self._ready().recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 break
             with contextlib.suppress(zmq.ZMQError):  # libzmq's own, of a connection that has ended
-                self._take_subscription(said.get(zmq.SRCFD), said.bytes)
+                self._take_subscription(subscription.get(zmq.SRCFD), subscription.bytes)
         return bool(self._topics)
 
     def _take_subscription(self, file: int, said: bytes) -> None:
-        kind, topic = said[:1], said[1:]
+        kind = said[:1]
+        topic = said[1:]
         if not (HEAD_BEGINS.startswith(topic) or topic.startswith(HEAD_BEGINS)):
             return
         # what it sent is read after its end
@@ -189,5 +192,6 @@ class FrameWatch(ZmqReceiver):
             if isinstance(frame, ShownFrame):
                 found.append(frame)
             else:
-                self.refused, self.why_refused = self.refused + 1, frame
+                self.refused = self.refused + 1
+                self.why_refused = frame
         return found

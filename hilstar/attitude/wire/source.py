@@ -63,23 +63,29 @@ class Convention(Table, frozen=True):
         """
         from hilstar.basics.rotation import conjugate
 
-        q = sent if self.scalar == "first" else sent[SCALAR_FROM_LAST]
-        return conjugate(q) if self.direction == "cam_to_icrs" else q
+        if self.scalar == "first":
+            q = sent
+        else:
+            q = sent[SCALAR_FROM_LAST]
+        if self.direction == "cam_to_icrs":
+            return conjugate(q)
+        return q
 
     def as_sent(self, q_icrs_to_frame: FloatArray) -> FloatArray:
         """What a sender of this convention sends for an attitude (4,) of its frame."""
         from hilstar.basics.rotation import conjugate
 
-        q = conjugate(q_icrs_to_frame) if self.direction == "cam_to_icrs" else q_icrs_to_frame
+        if self.direction == "cam_to_icrs":
+            q = conjugate(q_icrs_to_frame)
+        else:
+            q = q_icrs_to_frame
         return q if self.scalar == "first" else q[SCALAR_TO_LAST]
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
         """The sample with its quaternion from ICRS to its frame; its rate is what it was."""
-        return (
-            sent
-            if self.is_hilstars
-            else replace(sent, q_icrs_to_cam=self.q_icrs_to_frame(sent.q_icrs_to_cam))
-        )
+        if self.is_hilstars:
+            return sent
+        return replace(sent, q_icrs_to_cam=self.q_icrs_to_frame(sent.q_icrs_to_cam))
 
     def __str__(self) -> str:
         """As a bench file has it."""
@@ -120,7 +126,8 @@ class Mounting:
             return body
         from hilstar.basics.rotation import multiply
 
-        rate, acceleration = body.rate_cam_rad_s, body.acceleration_cam_rad_s2
+        rate = body.rate_cam_rad_s
+        acceleration = body.acceleration_cam_rad_s2
         return replace(
             body,
             q_icrs_to_cam=multiply(self.q_body_to_cam, body.q_icrs_to_cam),
@@ -168,26 +175,31 @@ class Conventions:
         """
         if self.of_body:
             return mounting.told
-        return [("mounting", UNUSED)] if self.of_packets and not mounting.is_identity else []
+        if self.of_packets and not mounting.is_identity:
+            return [("mounting", UNUSED)]
+        return []
 
     def lines(self, mounting: Mounting) -> list[str]:
         """The conventions, and the self-check, for a person."""
         from hilstar.basics.rotation import from_radec_roll_deg
 
         q = from_radec_roll_deg(*CHECK_RADEC_DEG, 0.0)
-        own = mounting.q_icrs_to_body(q) if self.of_body else q
+        own_q = mounting.q_icrs_to_body(q) if self.of_body else q
         ra_deg, dec_deg = CHECK_RADEC_DEG
         mounted = (
             f"it is the body's; [tracker] q_body_to_cam = {components(mounting.q_body_to_cam)}"
             " makes it the camera's"
         )
-        seen = f"{CHECK_STAR} (RA {ra_deg:g}, Dec {dec_deg:g}) is in the middle, north up"
-        meaning = mounted if self.of_body else "it is the camera itself; q_body_to_cam is not used"
+        check_text = f"{CHECK_STAR} (RA {ra_deg:g}, Dec {dec_deg:g}) is in the middle, north up"
+        if self.of_body:
+            meaning = mounted
+        else:
+            meaning = "it is the camera itself; q_body_to_cam is not used"
         return [
             f"{self.source}: {self.turns}; {self.scalar}",
             f"attitude: {meaning}",
             f"time: {self.time}",
-            f"self-check: at {self.written(own)} {seen}; yours should be too",
+            f"self-check: at {self.written(own_q)} {check_text}; yours should be too",
         ]
 
 
@@ -205,7 +217,8 @@ class SentAttitudes:
     """
 
     def __init__(self, convention: Convention = HILSTARS, mounting: Mounting | None = None) -> None:
-        self.convention, self.conventions = convention, packet_conventions(convention)
+        self.convention = convention
+        self.conventions = packet_conventions(convention)
         turns = convention.frame == "body" and mounting is not None and not mounting.is_identity
         self._mounting = mounting if turns else None
 
@@ -214,21 +227,24 @@ class SentAttitudes:
         from hilstar.basics.rotation import multiply
 
         q = self.convention.q_icrs_to_frame(sent)
-        return q if self._mounting is None else multiply(self._mounting.q_body_to_cam, q)
+        if self._mounting is None:
+            return q
+        return multiply(self._mounting.q_body_to_cam, q)
 
     def as_sent(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """What the sender sends for an attitude (4,) of the camera."""
-        q = (
-            q_icrs_to_cam
-            if self._mounting is None
-            else self._mounting.q_icrs_to_body(q_icrs_to_cam)
-        )
+        if self._mounting is None:
+            q = q_icrs_to_cam
+        else:
+            q = self._mounting.q_icrs_to_body(q_icrs_to_cam)
         return self.convention.as_sent(q)
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
         """The camera's attitude and motion of a sample as it was sent."""
         sample = self.convention.sample(sent)
-        return sample if self._mounting is None else self._mounting.sample(sample)
+        if self._mounting is None:
+            return sample
+        return self._mounting.sample(sample)
 
     def decoder(self, decode: Callable[[bytes], Event]) -> Callable[[bytes], Event]:
         """A decoder whose samples are the camera's; `decode` itself where they are already, which
@@ -240,7 +256,9 @@ class SentAttitudes:
 
         def decoded(message: bytes) -> Event:
             event = decode(message)
-            return self.sample(event) if isinstance(event, AttitudeSample) else event
+            if isinstance(event, AttitudeSample):
+                return self.sample(event)
+            return event
 
         return decoded
 
@@ -257,8 +275,12 @@ def packet_conventions(
     ]
     names = ["icrs" if reference == "ICRS" else "reference", convention.frame]
     if convention.direction == "cam_to_icrs":
-        frames, names = frames[::-1], names[::-1]
-    order = "(w, x, y, z)" if convention.scalar == "first" else "(x, y, z, w)"
+        frames = frames[::-1]
+        names = names[::-1]
+    if convention.scalar == "first":
+        order = "(w, x, y, z)"
+    else:
+        order = "(x, y, z, w)"
     return Conventions(
         source,
         f"q_{names[0]}_to_{names[1]} turns {frames[0]} into {frames[1]}",

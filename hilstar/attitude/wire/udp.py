@@ -138,9 +138,8 @@ class KernelStamps:
         for _, kind, stamp in ancillary:
             if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
                 seconds, ns = TIMESPEC.unpack(stamp)
-                offset_ns = (
-                    self._clock.monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
-                )
+                if offset_ns is None:
+                    offset_ns = self._clock.monotonic_minus_realtime_ns()
                 stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
                 return min(max(stamped_ns, self.empty_ns), now_ns)
         return now_ns
@@ -152,7 +151,8 @@ class Datagrams:
     """
 
     def __init__(self, made: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
-        self._socket, self._clock = made, clock
+        self._socket = made
+        self._clock = clock
         self._poll = select.poll()
         self._poll.register(made, select.POLLIN)
         made.setblocking(False)
@@ -168,10 +168,10 @@ class Datagrams:
         try:
             if place.host.version == 6:
                 made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            found = socket.getaddrinfo(
+            addresses = socket.getaddrinfo(
                 str(place.host), place.port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST
             )
-            made.bind(found[0][4])
+            made.bind(addresses[0][4])
         except OSError as error:
             made.close()
             trouble = TROUBLE.get(
@@ -186,10 +186,10 @@ class Datagrams:
         """Connected to a peer: only its datagrams arrive. Raises OSError where the host is
         unknown.
         """
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        made = socket.socket(found[0][0], socket.SOCK_DGRAM)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        made = socket.socket(addresses[0][0], socket.SOCK_DGRAM)
         try:
-            made.connect(found[0][4])
+            made.connect(addresses[0][4])
         except OSError:
             made.close()
             raise
@@ -232,7 +232,10 @@ class Datagrams:
         # a connected socket's send may report what became of an earlier datagram, and sends nothing
         for _ in range(2):
             try:
-                sent = self._socket.send(data) if to is None else self._socket.sendto(data, to)
+                if to is None:
+                    sent = self._socket.send(data)
+                else:
+                    sent = self._socket.sendto(data, to)
             except ConnectionRefusedError:
                 continue
             except OSError:
@@ -249,8 +252,8 @@ class Datagrams:
     def dropped(self) -> int:
         """How many datagrams the kernel dropped so far: by that filter, or for want of room."""
         with contextlib.suppress(OSError, struct.error):
-            told = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size)
-            return int(MEMINFO.unpack(told)[-1])
+            memory_info = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size)
+            return int(MEMINFO.unpack(memory_info)[-1])
         return 0
 
     def close(self) -> None:
@@ -272,10 +275,10 @@ class Credit:
 
     def spend(self, peer: SocketAddress, count: int) -> bool:
         """Whether `count` bytes may go to a peer; if so, they are deducted."""
-        left = self._bytes.get(peer, 0) - count
-        if left < 0:
+        rest_bytes = self._bytes.get(peer, 0) - count
+        if rest_bytes < 0:
             return False
-        self._bytes[peer] = left
+        self._bytes[peer] = rest_bytes
         return True
 
 
@@ -299,8 +302,10 @@ class UdpLink(StreamLink):
         sent: SentAttitudes = AS_SENT,
     ) -> None:
         super().__init__(notices, clock)
-        self.conventions, self._decode = sent.conventions, sent.decoder(decode)
-        self._allowed, self._credit = allowed, Credit()
+        self.conventions = sent.conventions
+        self._decode = sent.decoder(decode)
+        self._allowed = allowed
+        self._credit = Credit()
         self._strangers = self._dropped = self._looked_ns = 0
         self._filtered = False
         self._datagrams = Datagrams.bound(place, clock)
@@ -320,11 +325,11 @@ class UdpLink(StreamLink):
                 waiting.append(datagram)
                 continue
             self.link_counts.rejected += 1
-            said = (
+            notice = (
                 f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones"
                 " are only counted"
             )
-            self._notices.begin("sender-not-allowed", said)
+            self._notices.begin("sender-not-allowed", notice)
         self._look(len(taken) - len(waiting))
         admitted = self._gate.newest(waiting, declares_discontinuity)
         if len(taken) == MAX_TAKEN:
@@ -344,13 +349,14 @@ class UdpLink(StreamLink):
         if self._strangers > MAX_STRANGERS and not self._filtered:
             self._filtered = True
             if self._datagrams.keep_only(self._allowed.networks):
-                said = (
+                notice = (
                     f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed:"
                     " the kernel drops them now"
                 )
-                self._notices.tell("flood", said)
+                self._notices.tell("flood", notice)
         if now_ns - self._looked_ns > LOOK_NS:
-            self._looked_ns, self._strangers = now_ns, 0
+            self._looked_ns = now_ns
+            self._strangers = 0
             dropped = self._datagrams.dropped()
             self.link_counts.flooded += dropped - self._dropped
             self._dropped = dropped

@@ -102,13 +102,19 @@ def quaternion_of_mrp(sigma: tuple[float, ...]) -> tuple[float, float, float, fl
     x, y, z = sigma
     square = x * x + y * y + z * z
     share = -2.0 / (1.0 + square)  # 0 where the square overflows: then the shadow is 0
-    w = (1.0 - square) / (1.0 + square) if math.isfinite(square) else -1.0
+    if math.isfinite(square):
+        w = (1.0 - square) / (1.0 + square)
+    else:
+        w = -1.0
     return w, share * x, share * y, share * z
 
 
 def _written(q: FloatArray) -> str:
     """A body's attitude as Basilisk has it: the MRP of at most length 1."""
-    sigma = -q[1:] / (1.0 + q[0]) if q[0] >= 0 else q[1:] / (1.0 - q[0])
+    if q[0] >= 0:
+        sigma = -q[1:] / (1.0 + q[0])
+    else:
+        sigma = q[1:] / (1.0 - q[0])
     return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in sigma)})"
 
 
@@ -137,7 +143,8 @@ class DifferenceRates:
     """
 
     def __init__(self, max_step_ns: int, max_rate_rad_s: float) -> None:
-        self._max_step_ns, self._max_rate_rad_s = max_step_ns, max_rate_rad_s
+        self._max_step_ns = max_step_ns
+        self._max_rate_rad_s = max_rate_rad_s
         self._last: wire.AttitudeSample | None = None
         self._mean: tuple[FloatArray, float] | None = None
 
@@ -145,8 +152,10 @@ class DifferenceRates:
         """The sample with its rate (3,), rad/s, and acceleration (3,), rad/s^2, in the
         components of its own frame.
         """
-        before, self._last = self._last, sample
-        earlier, self._mean = self._mean, None
+        before = self._last
+        self._last = sample
+        earlier = self._mean
+        self._mean = None
         if before is None or not 0 < sample.t_ns - before.t_ns <= self._max_step_ns:
             return sample
         step_s = (sample.t_ns - before.t_ns) / NS_PER_S
@@ -179,7 +188,9 @@ class Follower:
         rates: DifferenceRates,
         taken: StateUse = "attitude",
     ) -> None:
-        self._name, self._mounting, self._rates = name, mounting, rates
+        self._name = name
+        self._mounting = mounting
+        self._rates = rates
         self._taken = taken
         self.conventions = replace(CONVENTIONS, turns="; ".join((TURNS, *TOLD[taken])))
 
@@ -221,46 +232,54 @@ class Follower:
         """
         if self._taken == "attitude":
             return None, None
-        place_m, velocity_m_s = craft.position_m, craft.velocity_m_s
+        place_m = craft.position_m
+        velocity_m_s = craft.velocity_m_s
         if self._taken == "state":
             earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
-            place_m, velocity_m_s = (
-                _against(place_m, earth.position_m),
-                _against(velocity_m_s, earth.velocity_m_s),
-            )
-        speed_m_s, far_km = math.hypot(*velocity_m_s), math.hypot(*place_m) / M_PER_KM
+            place_m = _against(place_m, earth.position_m)
+            velocity_m_s = _against(velocity_m_s, earth.velocity_m_s)
+        speed_m_s = math.hypot(*velocity_m_s)
+        far_km = math.hypot(*place_m) / M_PER_KM
         if len(velocity_m_s) != 3 or not speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
-            told = f"{speed_m_s:.3g} m/s" if velocity_m_s else "nothing"
+            if velocity_m_s:
+                state_text = f"{speed_m_s:.3g} m/s"
+            else:
+                state_text = "nothing"
             advice = (
                 f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves"
                 " it out"
             )
             return wire.Refusal(
-                "format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}"
+                "format", f"spacecraft {named(craft)}: its velocity is {state_text}, and {advice}"
             )
         velocity = np.array(velocity_m_s) / M_PER_KM
         if self._taken == "velocity":
             return None, velocity
         if len(place_m) == 3 and wire.MIN_PLACE_KM < far_km < wire.MAX_PLACE_KM:
             return np.array(place_m) / M_PER_KM, velocity
-        told = f"{far_km:.4g} km from the Earth's centre" if place_m else "nowhere"
+        if place_m:
+            state_text = f"{far_km:.4g} km from the Earth's centre"
+        else:
+            state_text = "nowhere"
         advice = (
             f'[spacecraft] orbit = "source" takes {wire.MIN_PLACE_KM:g} to {wire.MAX_PLACE_KM:g} km'
         )
-        return wire.Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
+        return wire.Refusal(
+            "format", f"spacecraft {named(craft)}: it is {state_text}, and {advice}"
+        )
 
     def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | wire.Refusal:
         """The spacecraft that is followed; parts of others (a parent is named) are taken only by
         their own name.
         """
         if self._name is None:
-            found = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
+            candidates = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
         else:
-            found = [craft for craft in spacecraft if craft.name == self._name]
-        if len(found) == 1:
-            return found[0]
+            candidates = [craft for craft in spacecraft if craft.name == self._name]
+        if len(candidates) == 1:
+            return candidates[0]
         names = (
-            ", ".join(map(named, (found if self._name is None else spacecraft)[:MAX_NAMES]))
+            ", ".join(map(named, (candidates if self._name is None else spacecraft)[:MAX_NAMES]))
             or "none"
         )
         if self._name is None:
@@ -271,7 +290,7 @@ class Follower:
         wanted = shortened(printable(self._name))
         return wire.Refusal(
             "format",
-            f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}",
+            f"[attitude] spacecraft = {wanted}: {len(candidates)} have that name; there: {names}",
         )
 
 
@@ -326,11 +345,9 @@ def named(craft: VizBody) -> str:
 
 
 def _against(own: Components, other: Components) -> Components:
-    return (
-        tuple(a - b for a, b in zip(own, other, strict=True))
-        if len(own) == len(other) == 3
-        else own
-    )
+    if len(own) == len(other) == 3:
+        return tuple(a - b for a, b in zip(own, other, strict=True))
+    return own
 
 
 class VizardLive(ZmqSocket, LockstepLink):
@@ -345,7 +362,8 @@ class VizardLive(ZmqSocket, LockstepLink):
         options.setdefault("bind", True)
         options["max_part_bytes"] = MAX_UPDATE_BYTES
         super().__init__(zmq.REP, endpoint, **options)
-        self._follower, self.conventions = follower, follower.conventions
+        self._follower = follower
+        self.conventions = follower.conventions
         self._tracker: TrackerCamera | None = None
         self._pictures: Pictures | None = None
         self._sample: wire.AttitudeSample | None = None  # at the last step
@@ -356,14 +374,19 @@ class VizardLive(ZmqSocket, LockstepLink):
         """What to answer for the pictures of Basilisk's cameras: those of the tracker at the
         last step, or none.
         """
-        self._tracker, self._pictures = tracker, pictures
+        self._tracker = tracker
+        self._pictures = pictures
 
     def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next step, or None; it must be answered before the next request can arrive."""
-        parts = self._take_parts() if self._waits(timeout_ms) else None
+        if self._waits(timeout_ms):
+            parts = self._take_parts()
+        else:
+            parts = None
         if parts is None:
             return None
-        host_ns, word = self._clock.now_ns(), parts[0]
+        host_ns = self._clock.now_ns()
+        word = parts[0]
         if word == SIM_UPDATE:
             return self._step(host_ns, parts)
         if (
@@ -406,9 +429,9 @@ class VizardLive(ZmqSocket, LockstepLink):
             trouble = disagreement(self._described[camera], self._tracker)
             if trouble is not None:
                 self._notices.tell("other-camera", trouble)
-        return (
-            b"" if self._sample is None or self._pictures is None else self._pictures(self._sample)
-        )
+        if self._sample is None or self._pictures is None:
+            return b""
+        return self._pictures(self._sample)
 
     def answer(self, status: wire.Status, shown_ns: int, refusal: wire.Refusal | None) -> None:
         """Let the simulation go on; or, where its step was refused, end it."""
@@ -449,7 +472,9 @@ class Opening:
         return out
 
     def _released(self) -> list[Arrival[wire.Event]]:
-        released, self._held, self._opens = self._held, [], False
+        released = self._held
+        self._held = []
+        self._opens = False
         return released
 
 
@@ -458,7 +483,9 @@ class BroadcastDecoder(PacketDecoder):
 
     def __init__(self, follower: Follower, clock: HostClock = HOST_CLOCK) -> None:
         super().__init__()
-        self._follower, self.conventions, self._clock = follower, follower.conventions, clock
+        self._follower = follower
+        self.conventions = follower.conventions
+        self._clock = clock
         self._opening = Opening()
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:

@@ -122,17 +122,17 @@ def decode_update(message: bytes) -> SimUpdate:
     return SimUpdate(
         round(time_ns),
         read.time.frame,
-        tuple(_body(each) for each in read.spacecraft),
+        tuple(_body(body) for body in read.spacecraft),
         tuple(
             VizCamera(c.identity, c.field_of_view_deg, _few(c.resolution_px), _few(c.sigma))
             for c in read.cameras
         ),
-        tuple(_body(each)._replace(sigma_bn=()) for each in read.bodies),
+        tuple(_body(body)._replace(sigma_bn=()) for body in read.bodies),
     )
 
 
 def _body(read: Any) -> VizBody:
-    names = (each.decode("utf-8", "replace") for each in (read.name, read.parent))
+    names = (name_bytes.decode("utf-8", "replace") for name_bytes in (read.name, read.parent))
     return VizBody(*names, *map(_few, (read.position_m, read.velocity_m_s, read.sigma_bn)))
 
 

@@ -39,7 +39,8 @@ class PacketDecoder:
     stamped = False  # whether messages carry their own times of arrival
 
     def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
-        self.conventions, self.decode = sent.conventions, sent.decoder(wire.decode)
+        self.conventions = sent.conventions
+        self.decode = sent.decoder(wire.decode)
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
         """What messages say."""
@@ -66,8 +67,11 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         decoder: PacketDecoder = PACKET_DECODER,
         **options: Unpack[SocketOptions],
     ) -> None:
-        self.topic, self.decoder, self.bound = topic, decoder, options.get("bind", False)
-        self.conventions, self.stamped = decoder.conventions, decoder.stamped
+        self.topic = topic
+        self.decoder = decoder
+        self.bound = options.get("bind", False)
+        self.conventions = decoder.conventions
+        self.stamped = decoder.stamped
         super().__init__(zmq.SUB, endpoint, **options)
         if not self.bound:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
@@ -141,9 +145,13 @@ class ZmqApart(StreamLink):
     ) -> None:
         super().__init__(notices, clock)
         link.close()
-        self.verb, self.endpoint, self.conventions = link.verb, link.endpoint, link.conventions
+        self.verb = link.verb
+        self.endpoint = link.endpoint
+        self.conventions = link.conventions
         self.link_counts = link.link_counts
-        self._decoder, self.bound, self._opener = link.decoder, link.bound, link.opener()
+        self._decoder = link.decoder
+        self.bound = link.bound
+        self._opener = link.opener()
         self._waiting: list[RawMessage] = []
         self._ordered = False
         self._reader = ReaderProcess(self._notices, clock=clock)
@@ -157,7 +165,8 @@ class ZmqApart(StreamLink):
         for the first.
         """
         self.wait_for_message(timeout_ms)
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         return self._decoder.arrivals(waiting)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
@@ -239,7 +248,8 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
     def __init__(
         self, endpoint: str, *, sent: SentAttitudes = AS_SENT, **options: Unpack[SocketOptions]
     ) -> None:
-        self.conventions, self._decode = sent.conventions, sent.decoder(wire.decode)
+        self.conventions = sent.conventions
+        self._decode = sent.decoder(wire.decode)
         options.setdefault("bind", True)
         super().__init__(zmq.REP, endpoint, **options)
 
@@ -249,10 +259,14 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
         Time requests are answered here. libzmq announces a request without its delimiter, then
         drops it: none is waited for.
         """
-        message = self._take() if self._waits(timeout_ms) else None
+        if self._waits(timeout_ms):
+            message = self._take()
+        else:
+            message = None
         if message is None:
             return None
-        host_ns, event = self._clock.now_ns(), self._decode(message)
+        host_ns = self._clock.now_ns()
+        event = self._decode(message)
         if isinstance(event, wire.TimeRequest):
             self._answer(
                 wire.encode(
@@ -269,7 +283,10 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
             self._answer(wire.encode(status))
             return
         fields = {name: getattr(status, name) for name in status.__dataclass_fields__}
-        trouble = None if refusal is None else {"reason": refusal.reason, "detail": refusal.detail}
+        if refusal is None:
+            trouble = None
+        else:
+            trouble = {"reason": refusal.reason, "detail": refusal.detail}
         self._answer(msgspec.json.encode({**fields, "shown_ns": shown_ns, "refused": trouble}))
 
     def _answer(self, message: bytes) -> None:

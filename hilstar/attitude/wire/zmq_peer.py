@@ -121,7 +121,10 @@ class PeerLook:
     """Looks at what answers at an address, on a thread of its own, and not too often."""
 
     def __init__(self, address: str, kind: str, keys: bool, clock: HostClock = HOST_CLOCK) -> None:
-        self._address, self._kind, self._keys, self._clock = address, kind, keys, clock
+        self._address = address
+        self._kind = kind
+        self._keys = keys
+        self._clock = clock
         self._found: str | None = None
         self._told = ""
         self._again = clock.within(0.0)
@@ -139,8 +142,9 @@ class PeerLook:
         """What was found, once, where it is new: a line for a person; "" for nothing, and for a
         peer that seems right.
         """
-        found, self._found = self._found, None
-        if not found or found == self._told:
+        trouble = self._found
+        self._found = None
+        if not trouble or trouble == self._told:
             return ""
-        self._told = found
-        return found
+        self._told = trouble
+        return trouble

@@ -90,7 +90,8 @@ class _MemoryWatch:
     """
 
     def __init__(self, clock: HostClock = HOST_CLOCK) -> None:
-        self._clock, self._file = clock, -1
+        self._clock = clock
+        self._file = -1
         # kept open: a process out of descriptors must still see its memory
         with contextlib.suppress(OSError):
             self._file = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
@@ -139,7 +140,10 @@ def _raise_file_limit() -> None:
     ledger and display.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
+    if hard == resource.RLIM_INFINITY:
+        wanted = WANTED_FILES
+    else:
+        wanted = min(hard, WANTED_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with contextlib.suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
@@ -166,13 +170,11 @@ class _Doorkeeper:
         self.lost = False
         self.left: set[int] = set()
         self.place: int | str = ""
-        self._watched, self._look, self._counts, self._notices, self._clock = (
-            watched,
-            look,
-            counts,
-            notices,
-            clock,
-        )
+        self._watched = watched
+        self._look = look
+        self._counts = counts
+        self._notices = notices
+        self._clock = clock
         self._bound = look is None
         self._greeted = False  # whether the connection that we made had its handshake
         self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
@@ -210,7 +212,10 @@ class _Doorkeeper:
             self._ungreeted[value] = self._clock.now_ns()
             self.left.discard(value)
             with _connection(value) as connection:
-                name = () if connection is None else connection.getpeername()
+                if connection is None:
+                    name = ()
+                else:
+                    name = connection.getpeername()
                 self._open[value] = (
                     f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
                 )
@@ -232,8 +237,11 @@ class _Doorkeeper:
         self.lost = True
         if self._bound:
             self.left.add(file)
-        who, failure = self._open.pop(file, ""), self._failure
-        greeted, self._failure, self._greeted = self._greeted, "", False
+        who = self._open.pop(file, "")
+        failure = self._failure
+        greeted = self._greeted
+        self._failure = ""
+        self._greeted = False
         accepted_ns = self._ungreeted.pop(file, None)
         if (
             accepted_ns is not None
@@ -259,9 +267,9 @@ class _Doorkeeper:
             self._notices.tell("lost", "lost the connection to the sender; waiting for it")
 
     def _tell_look(self) -> None:
-        found = "" if self._look is None else self._look.take()
-        if found:
-            self._notices.tell(WRONG_PEER, found)
+        trouble = "" if self._look is None else self._look.take()
+        if trouble:
+            self._notices.tell(WRONG_PEER, trouble)
 
     def _shut_newest(self) -> None:
         newest = [file for file in list(self._open)[MAX_CONNECTIONS:] if file not in self._shut]
@@ -334,7 +342,8 @@ class ZmqSocket(Link):
     def __init__(self, kind: int, endpoint: str, **options: Unpack[SocketOptions]) -> None:
         super().__init__(options.get("notices"), options.get("clock", HOST_CLOCK))
         self._max_part_bytes = options.get("max_part_bytes", MAX_PART_BYTES)
-        bind, keys = options.get("bind", False), options.get("keys", NO_KEYS)
+        bind = options.get("bind", False)
+        keys = options.get("keys", NO_KEYS)
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
@@ -344,9 +353,10 @@ class ZmqSocket(Link):
         self._keys = keys
         self._pair = None if keys.secret_key is None else load_secret(keys.secret_key)
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
-        allowed = (
-            AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
-        )
+        if bind and keys.allowed_clients is not None:
+            allowed = AllowList(keys.allowed_clients)
+        else:
+            allowed = None
         _raise_file_limit()
         self._memory = _MemoryWatch(self._clock)
         self._context = zmq.Context()
@@ -373,7 +383,10 @@ class ZmqSocket(Link):
         self._configure(made)
         self._socket = made
         kind = zmq.SocketType(self._kind).name
-        look = None if self._bind else PeerLook(self._address, kind, keys=self._pair is not None)
+        if self._bind:
+            look = None
+        else:
+            look = PeerLook(self._address, kind, keys=self._pair is not None)
         self._keeper = _Doorkeeper(
             made, look=look, counts=self.link_counts, notices=self._notices, clock=self._clock
         )
@@ -472,7 +485,10 @@ class ZmqSocket(Link):
                     return parts
                 parts.append(taken.recv(zmq.NOBLOCK))
             # a REP socket that was asked has to answer
-            passed_over = 0 if self._kind == zmq.REP else MAX_PASSED_OVER
+            if self._kind == zmq.REP:
+                passed_over = 0
+            else:
+                passed_over = MAX_PASSED_OVER
             for _ in range(passed_over):
                 if not taken.getsockopt(zmq.RCVMORE):
                     self._notices.tell(
@@ -523,5 +539,8 @@ def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:
             " (--connect, bind = false) instead"
         )
     verb = "bind" if bind else "connect"
-    form = PATH_FORM if endpoint.startswith("ipc:") else ENDPOINT_FORM
+    if endpoint.startswith("ipc:"):
+        form = PATH_FORM
+    else:
+        form = ENDPOINT_FORM
     return f"{endpoint}: cannot {verb} ({zmq.strerror(error.errno or 0)}); {form}"

@@ -78,15 +78,15 @@ def install() -> None:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
-    watched, told = socket.socketpair()
-    told.setblocking(False)
+    watched, teller = socket.socketpair()
+    teller.setblocking(False)
     parent = os.getpid()
     _ending.guard = os.fork()
     if _ending.guard == 0:
-        told.close()
+        teller.close()
         _guard(parent, watched)
     threading.Thread(target=_watch, args=(watched,), name="hilstar-signals", daemon=True).start()
-    signal.set_wakeup_fd(told.detach(), warn_on_full_buffer=False)
+    signal.set_wakeup_fd(teller.detach(), warn_on_full_buffer=False)
     for number in ENDING:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _handle)
@@ -123,7 +123,9 @@ def is_command() -> bool:
 
 def caught() -> str | None:
     """The name of the signal that ends this process; None while none has come."""
-    return None if _ending.signal is None else signal.Signals(_ending.signal).name
+    if _ending.signal is None:
+        return None
+    return signal.Signals(_ending.signal).name
 
 
 def exit_code() -> int:
@@ -186,8 +188,8 @@ def leave(code: int) -> NoReturn:
         with contextlib.suppress(ValueError):  # not the main thread
             signal.signal(number, signal.SIG_DFL)
     _let_guard_go()
-    own = {"hilstar-signals", "hilstar-stderr"}
-    others = [thread for thread in threading.enumerate() if thread.name not in own]
+    own_names = {"hilstar-signals", "hilstar-stderr"}
+    others = [thread for thread in threading.enumerate() if thread.name not in own_names]
     if _ending.signal is None and len(others) == 1:
         if sys.getprofile() is not None:
             sys.exit(code)
@@ -227,11 +229,10 @@ def _watch(watched: socket.socket) -> None:
             numbers = _signals_in(watched)
         heard_twice = len(_signals_in(watched)) > len(numbers)
     name = signal.Signals(numbers[0]).name
-    why = (
-        "at the second signal"
-        if heard_twice
-        else f"{THREAD_WAITS_S:g} s after {name}, in the middle of {_whereabouts()}"
-    )
+    if heard_twice:
+        why = "at the second signal"
+    else:
+        why = f"{THREAD_WAITS_S:g} s after {name}, in the middle of {_whereabouts()}"
     _say_if_read(f"hilstar: ended {why}\n")
     end_children(os.getpid(), _ending.guard)
     _let_guard_go()
@@ -352,7 +353,8 @@ class _QueuedStderr(io.RawIOBase):
                 while not self._waiting:
                     self._changed.wait()
                 piece = self._waiting.popleft()
-                dropped, self._dropped = self._dropped, 0
+                dropped = self._dropped
+                self._dropped = 0
             data = piece + (
                 f"hilstar: {dropped} lines were dropped: nothing read them\n".encode()
                 if dropped

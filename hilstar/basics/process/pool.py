@@ -99,9 +99,9 @@ class ProcessPool(Closing):
     def _news(self, worker: WorkerProcess) -> News:
         with contextlib.suppress(EOFError, OSError):
             if worker.link.poll():  # an answer of one that has died since is still heard
-                kind, said = worker.link.recv()
+                kind, payload = worker.link.recv()
                 worker.ready = True
-                return News(worker, kind, said)
+                return News(worker, kind, payload)
         self._remove(worker)
         return News(worker, "died", worker.process.exitcode)
 

@@ -51,18 +51,18 @@ class Child(Closing):
         self._said = {"out": bytearray(), "err": bytearray()}
         streams = [("out", self._process.stdout), ("err", self._process.stderr)]
         self._readers = [
-            threading.Thread(target=self._read, args=each, daemon=True)
-            for each in streams
-            if each[1] is not None
+            threading.Thread(target=self._read, args=stream, daemon=True)
+            for stream in streams
+            if stream[1] is not None
         ]
         for reader in self._readers:
             reader.start()
 
     def _read(self, name: str, stream: IO[bytes]) -> None:
-        kept = self._said[name]
+        buffer = self._said[name]
         while chunk := os.read(stream.fileno(), CHUNK_BYTES):
-            kept += chunk[: MAX_OUTPUT_BYTES - len(kept)]
-            if len(kept) == MAX_OUTPUT_BYTES:
+            buffer += chunk[: MAX_OUTPUT_BYTES - len(buffer)]
+            if len(buffer) == MAX_OUTPUT_BYTES:
                 self.too_much = True
                 self.kill()
                 return
@@ -126,7 +126,9 @@ class Service(Closing):
         status: Callable[[], str],
         environment: Mapping[str, str] = os.environ,
     ) -> None:
-        self._ready, self._alive, self._status = ready, alive, status
+        self._ready = ready
+        self._alive = alive
+        self._status = status
         self._address = environment.get("NOTIFY_SOCKET", "")
         self._each_s = EACH_S
         # where systemd watches it, half of what it waits
@@ -139,7 +141,10 @@ class Service(Closing):
         self._thread = threading.Thread(target=self._run, name="hilstar-service", daemon=True)
 
     def _send(self, text: str) -> None:
-        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
+        if self._address.startswith("@"):
+            address = "\0" + self._address[1:]
+        else:
+            address = self._address
         with contextlib.suppress(OSError):  # nobody listens, or its queue is full
             self._socket.sendto(text.encode(errors="replace"), address)
 

@@ -87,12 +87,16 @@ class HostClock:
         """The offset between the two clocks of this machine, both read within a few microseconds
         where that succeeds.
         """
-        best_ns, offset_ns = None, 0
+        best_ns = None
+        offset_ns = 0
         for _ in range(CLOCK_TRIES):
-            before_ns, realtime_ns, after_ns = self.now_ns(), self.realtime_ns(), self.now_ns()
+            before_ns = self.now_ns()
+            realtime_ns = self.realtime_ns()
+            after_ns = self.now_ns()
             took_ns = after_ns - before_ns
             if best_ns is None or took_ns < best_ns:
-                best_ns, offset_ns = took_ns, (before_ns + after_ns) // 2 - realtime_ns
+                best_ns = took_ns
+                offset_ns = (before_ns + after_ns) // 2 - realtime_ns
             if took_ns < NEAR_NS:
                 break
         return offset_ns
@@ -101,11 +105,11 @@ class HostClock:
         """The offset to Unix time, and how wrong that may be: what NTP or PTP told the kernel
         (adjtimex, `maxerror`).
         """
-        told = Timex()  # modes = 0: nothing is set
-        answered = ctypes.CDLL(None).adjtimex(ctypes.byref(told)) >= 0
+        kernel_clock = Timex()  # modes = 0: nothing is set
+        answered = ctypes.CDLL(None).adjtimex(ctypes.byref(kernel_clock)) >= 0
         return UnixOffset(
             self.monotonic_minus_realtime_ns(),
-            told.maxerror * 1000 if answered else UNDISCIPLINED_NS,
+            kernel_clock.maxerror * 1000 if answered else UNDISCIPLINED_NS,
         )
 
     def sleep(self, seconds: float) -> None:
@@ -131,7 +135,8 @@ class Deadline:
     """A moment of a clock."""
 
     def __init__(self, clock: HostClock, due_ns: int) -> None:
-        self._clock, self._due_ns = clock, due_ns
+        self._clock = clock
+        self._due_ns = due_ns
 
     @property
     def left_s(self) -> float:
@@ -151,7 +156,9 @@ class BackOff(Deadline):
 
     def __init__(self, min_s: float, max_s: float, clock: HostClock) -> None:
         super().__init__(clock, clock.now_ns())
-        self._min_s, self._max_s, self._wait_s = min_s, max_s, min_s
+        self._min_s = min_s
+        self._max_s = max_s
+        self._wait_s = min_s
 
     def put_off(self, *, anew: bool = False) -> None:
         """The try failed; `anew` for the first failure after all was well."""
@@ -232,8 +239,10 @@ class PromptWhileLight:
                 )
         self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
         self._allowed = self._prompt
-        self._wall_s, self._cpu_s = wall_s, cpu_s
-        self._looked_s, self._used_s = wall_s(), cpu_s()
+        self._wall_s = wall_s
+        self._cpu_s = cpu_s
+        self._looked_s = wall_s()
+        self._used_s = cpu_s()
 
     def give_up(self) -> None:
         """Run this process as any other from now on, and whatever it starts: it is about to run
@@ -251,7 +260,8 @@ class PromptWhileLight:
             return
         used_s = self._cpu_s()
         heavy = used_s - self._used_s > HEAVY * (now_s - self._looked_s)
-        self._looked_s, self._used_s = now_s, used_s
+        self._looked_s = now_s
+        self._used_s = used_s
         if heavy and self._prompt:
             self._prompt = not _set_all_threads(os.SCHED_OTHER, 0)
         elif not heavy and not self._prompt:

@@ -44,10 +44,10 @@ def user_function(name: str, folder: Path, trust: Collection[str] = ()) -> Calla
         ) from error
     finally:
         _look_here_last(str(folder.resolve()))
-    found = getattr(module, function_name, None)
-    if not callable(found):
+    function = getattr(module, function_name, None)
+    if not callable(function):
         raise UserCodeError(f"{module_name} has no function {function_name}")
-    return found  # type: ignore[no-any-return]
+    return function  # type: ignore[no-any-return]
 
 
 def _check_place(package: str, folder: str) -> None:
@@ -60,13 +60,15 @@ def _check_place(package: str, folder: str) -> None:
         )
     loaded = sys.modules.get(package)
     if loaded is not None and package in _folders and _folders[package] != folder:
-        for each in [each for each in sys.modules if each.partition(".")[0] == package]:
-            del sys.modules[each]
+        for module_name in [
+            module_name for module_name in sys.modules if module_name.partition(".")[0] == package
+        ]:
+            del sys.modules[module_name]
         loaded = None
-    own = package in sys.stdlib_module_names or (
+    is_foreign = package in sys.stdlib_module_names or (
         loaded is not None and not _is_same(loaded.__spec__, spec)
     )
-    if own:
+    if is_foreign:
         raise UserCodeError(
             f"{package} is the name of a module of Python or of hilstar; give {folder}/{package}"
             " another"

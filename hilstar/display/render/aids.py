@@ -64,7 +64,8 @@ class AidLevels:
         """
         if not overlay:
             return levels
-        levels, white = levels.copy(), 2**self.bits - 1
+        levels = levels.copy()
+        white = 2**self.bits - 1
         patch, line = (
             level_of_code(self.response, code)
             for code in (round(patch_share * white), int(LINE_SHARE * white))

@@ -43,30 +43,31 @@ class Gpu:
 
 def gpus() -> list[Gpu]:
     """EGL's devices in its order, a context made on each; none where EGL has no list of them."""
-    found = []
+    listed = []
     for index in range(_device_count()):
         renderer = ""
         with contextlib.suppress(MachineError):
             ctx = _context_on(index)
             renderer = str(ctx.info["GL_RENDERER"])
             ctx.release()
-        found.append(Gpu(index, renderer))
-    return found
+        listed.append(Gpu(index, renderer))
+    return listed
 
 
 def _device_count() -> int:
     """How many devices EGL lists (EGL_EXT_device_enumeration)."""
-    found = ctypes.c_int()
+    device_count = ctypes.c_int()
     with contextlib.suppress(OSError, AttributeError):
         find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
-        find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+        find.restype = ctypes.c_void_p
+        find.argtypes = [ctypes.c_char_p]
         if address := find(b"eglQueryDevicesEXT"):
             devices = (ctypes.c_void_p * MAX_GPUS)()
             query = ctypes.CFUNCTYPE(
                 ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int)
             )(address)
-            query(MAX_GPUS, devices, ctypes.byref(found))
-    return found.value
+            query(MAX_GPUS, devices, ctypes.byref(device_count))
+    return device_count.value
 
 
 def create_context(gpu: int | str | None = None) -> moderngl.Context:
@@ -79,12 +80,12 @@ def create_context(gpu: int | str | None = None) -> moderngl.Context:
     """
     if gpu is None or (isinstance(gpu, int) and gpu < _device_count()):
         return _context_on(gpu)
-    found = gpus()
-    for one in found:
-        if isinstance(gpu, str) and gpu.lower() in one.renderer.lower():
-            return _context_on(one.index)
-    known = "; ".join(one.line() for one in found) or "none: EGL lists no devices"
-    meant = did_you_mean(gpu, (one.renderer for one in found))
+    listed = gpus()
+    for candidate in listed:
+        if isinstance(gpu, str) and gpu.lower() in candidate.renderer.lower():
+            return _context_on(candidate.index)
+    known = "; ".join(candidate.line() for candidate in listed) or "none: EGL lists no devices"
+    meant = did_you_mean(gpu, (candidate.renderer for candidate in listed))
     raise NotThereError(
         f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}"
     )
@@ -121,11 +122,10 @@ def described() -> str:
             f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to"
             f" {info['GL_POINT_SIZE_RANGE'][1]:g} px"
         )
-        exact = (
-            "compute shaders"
-            if ctx.version_code >= COMPUTE_VERSION
-            else "NumPy (slow: their shaders need OpenGL 4.3)"
-        )
+        if ctx.version_code >= COMPUTE_VERSION:
+            exact = "compute shaders"
+        else:
+            exact = "NumPy (slow: their shaders need OpenGL 4.3)"
         stars = "CPU" if draws_by_cpu(ctx) else "points"
         return f"{what}; round by {stars}, exact and temporal by {exact}"
     finally:
@@ -158,7 +158,9 @@ def draws_by_cpu(ctx: moderngl.Context) -> bool:
     processor's, too.
     """
     wanted = wanted_way()
-    return is_software(ctx) if wanted is None else wanted == "cpu"
+    if wanted is None:
+        return is_software(ctx)
+    return wanted == "cpu"
 
 
 def shares_memory(ctx: moderngl.Context) -> bool:
@@ -183,11 +185,13 @@ def pinned(
     buffer of the same memory.
     """
     # whole words, too
-    count, size = math.prod(shape), -(-math.prod(shape) * np.dtype(dtype).itemsize // 4) * 4
+    count = math.prod(shape)
+    size = -(-math.prod(shape) * np.dtype(dtype).itemsize // 4) * 4
     pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     values = np.frombuffer(pages, dtype, count).reshape(shape)
     find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
-    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    find.restype = ctypes.c_void_p
+    find.argtypes = [ctypes.c_char_p]
     bind = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_uint)(find(b"glBindBuffer"))
     specify = ctypes.CFUNCTYPE(
         None, ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_uint

@@ -101,12 +101,14 @@ def _places(
     width, height = resolution_px
     step = np.arange(side) - (side - 1) // 2
     place = np.add.outer(width * step, step).reshape(-1, 1) + (y * width + x)
-    low, high = step[0], step[-1]
+    low = step[0]
+    high = step[-1]
     is_cut = (x + low < 0) | (x + high >= width) | (y + low < 0) | (y + high >= height)
     if not is_cut.any():
         return place, None
     cut = np.flatnonzero(is_cut)
-    columns, rows = step[:, None] + x[cut], step[:, None] + y[cut]
+    columns = step[:, None] + x[cut]
+    rows = step[:, None] + y[cut]
     in_columns = (columns >= 0) & (columns < width)
     in_rows = (rows >= 0) & (rows < height)
     on_image = np.ones((side, side, len(x)), dtype=np.bool_)
@@ -131,13 +133,18 @@ class CpuStars:
         sums: npt.NDArray[np.int32] | None = None,
         least_side_px: int = 1,
     ) -> None:
-        self._units, self._size_px, self._psf = units, units.size_px, units.psf
+        self._units = units
+        self._size_px = units.size_px
+        self._psf = units.psf
         planes = self._planes = units.planes
         self._least_side_px = least_side_px
         self._count = len(planes.panels)
         self._levels = levels.reshape(-1, levels.shape[-1])
         pixels = math.prod(self._size_px)
-        whole = np.zeros(pixels * self._count, dtype=np.int32) if sums is None else sums
+        if sums is None:
+            whole = np.zeros(pixels * self._count, dtype=np.int32)
+        else:
+            whole = sums
         self._whole_sums = whole.reshape(pixels, self._count)
         self._fine_sums: npt.NDArray[np.float64] | None = None  # where an int32 is too small
         self._sums: npt.NDArray[Any] = self._whole_sums  # the last frame's
@@ -163,7 +170,10 @@ class CpuStars:
         """Make black what the last frame drew, and take a frame's floor, which becomes its levels;
         None for black.
         """
-        drawn = None if self._on_floor and floor is None else self._drawn
+        if self._on_floor and floor is None:
+            drawn = None
+        else:
+            drawn = self._drawn
         for image in self._images():
             _blacken(image, drawn)
         self._on_floor = floor is not None
@@ -172,7 +182,10 @@ class CpuStars:
         self._drawn = NOWHERE
 
     def _images(self) -> list[npt.NDArray[Any]]:
-        fine = [] if self._fine_sums is None else [self._fine_sums]
+        if self._fine_sums is None:
+            fine = []
+        else:
+            fine = [self._fine_sums]
         return [self._levels, self._whole_sums, *fine]
 
     def add(self, sprites: FrameLight, unit_e_per_s: list[float] | None) -> None:
@@ -235,7 +248,8 @@ class CpuStars:
         is_lit = self._within_reach(squares, reach_px)
         if squares.on_image is not None:
             is_lit &= squares.on_image
-        flat, place = self._sums.reshape(-1), squares.place.ravel()
+        flat = self._sums.reshape(-1)
+        place = squares.place.ravel()
         for plane, rate in enumerate(rates):
             fraction_px = squares.fraction_px
             if self._planes.apart:
@@ -248,7 +262,10 @@ class CpuStars:
             units *= is_lit
             units += np.float32(0.5)
             added = units.astype(flat.dtype)
-            where = place if self._count == 1 else place * self._count + plane
+            if self._count == 1:
+                where = place
+            else:
+                where = place * self._count + plane
             np.add.at(flat, where, added.ravel())
 
     def _within_reach(self, squares: Squares, reach_px: Float32Array) -> BoolArray:
@@ -274,14 +291,18 @@ class CpuStars:
         """Make levels of a plane's sums where they light a pixel."""
         sums = self._sums[:, plane]
         unit_e_per_s = self.unit_e_per_s[plane]
-        least = 1 if self._on_floor else max(1, int(self._dark_e_per_s[plane] / unit_e_per_s))
+        if self._on_floor:
+            least = 1
+        else:
+            least = max(1, int(self._dark_e_per_s[plane] / unit_e_per_s))
         if self._drawn is None:
             place = np.flatnonzero(sums >= least)
             lit = sums[place]
         else:
             every = sums[self._drawn]
             is_lit = np.flatnonzero(every >= least)
-            place, lit = self._drawn[is_lit], every[is_lit]
+            place = self._drawn[is_lit]
+            lit = every[is_lit]
         light = lit.astype(np.float32) * np.float32(unit_e_per_s)
         if self._gain is not None:
             light *= self._gain[place]
@@ -308,7 +329,8 @@ class CpuImage:
     """
 
     def __init__(self, resolution_px: tuple[int, int], psf: Psf) -> None:
-        self._size_px, self._psf = resolution_px, psf
+        self._size_px = resolution_px
+        self._psf = psf
         self._light = np.zeros(math.prod(resolution_px), dtype=np.float32)
         self.image = self._light.reshape(resolution_px[::-1])
         self.image.flags.writeable = False
@@ -345,7 +367,8 @@ def least_side_px(psf: Psf) -> int:
     """The side of the square that holds all pixels which `exact` may light about a star."""
     order = PixelOrder(psf)
     place = np.stack([order.row, order.column])[:, : order.near] + order.first
-    before, after = -int(place.min()), int(place.max())
+    before = -int(place.min())
+    after = int(place.max())
     if order.size % 2:
         return 2 * max(before, after) + 1
     return 2 * max(before + 1, after)

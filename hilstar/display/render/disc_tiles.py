@@ -55,16 +55,17 @@ class Sure:
         """
         times = np.where(smooth, SMOOTH_TIMES, SURE_TIMES)
         rows, columns = smooth.shape[-2:]
-        corners = [
-            e_per_s[..., row : row + rows, column : column + columns]
-            for row, column in set(CORNERS)
-        ]
-        brightest, darkest = np.maximum.reduce(corners), np.minimum.reduce(corners)
+        corners = []
+        for row, column in set(CORNERS):
+            corners.append(e_per_s[..., row : row + rows, column : column + columns])
+        brightest = np.maximum.reduce(corners)
+        darkest = np.minimum.reduce(corners)
         return darkest > times * self.white_e_per_s, brightest * times < self.dark_e_per_s
 
     def apart(self, left: int, top: int, rows: int, columns: int) -> BoolArray:
         """Which tiles (rows, columns) from a corner of the image on have no sprite's light."""
-        apart, reach = np.ones((rows + 1, columns + 1), dtype=np.bool_), self.reach_px
+        apart = np.ones((rows + 1, columns + 1), dtype=np.bool_)
+        reach = self.reach_px
         for across in range(-reach, reach + TILE_PX, TILE_PX):
             for down in range(-reach, reach + TILE_PX, TILE_PX):
                 away = min(across, reach) - left, min(down, reach) - top
@@ -124,7 +125,8 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
         for begin, size in ((left, width), (top, height))
     )
     whole = _lattice(light, np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64), TILE_PX)
-    drawn, white = ~whole.is_beside, np.zeros_like(whole.is_face)
+    drawn = ~whole.is_beside
+    white = np.zeros_like(whole.is_face)
     apart = white
     if sure is not None:
         smooth = whole.is_inside | whole.is_air
@@ -134,10 +136,8 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
         # beside it.
         around = _all(_all(np.pad(dark, 1, constant_values=True)))
         drawn &= ~(apart & dark & (smooth | around))
-    some, of_air = (
-        np.argwhere(drawn),
-        (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread),
-    )
+    some = np.argwhere(drawn)
+    of_air = (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread)
     if not len(some):
         return Tiles(
             (left, top, 0, 0), NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, of_air
@@ -160,17 +160,15 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     fine = _lattice(
         light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX
     )
-    fine_white = (
-        np.zeros_like(fine.is_face)
-        if sure is None
-        else sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)[0]
-    )
-    fine_inside, fine_air = fine.is_inside & ~fine_white, fine.is_air & ~fine_white
-    face, inside, air = (
-        whole.is_face & drawn,
-        whole.is_inside & drawn & ~whole.is_face,
-        whole.is_air & drawn,
-    )
+    if sure is None:
+        fine_white = np.zeros_like(fine.is_face)
+    else:
+        fine_white = sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)[0]
+    fine_inside = fine.is_inside & ~fine_white
+    fine_air = fine.is_air & ~fine_white
+    face = whole.is_face & drawn
+    inside = whole.is_inside & drawn & ~whole.is_face
+    air = whole.is_air & drawn
     return Tiles(
         (int(inner[0]), int(inner[1]), int(inner[2]), int(inner[3])),
         _corners(whole.face, face & ~apart),
@@ -188,14 +186,13 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     """The light at lattices of places (..., rows, columns, 2), `size_px` apart, and between
     them, but for the outer ones.
     """
-    disc, px_per_rad, sigma_px = (
-        light.disc,
-        light.camera.scales_px_rad()[0],
-        max(light.psf.variance_px2) ** 0.5,
-    )
-    shape, distance = places.shape[:-1], disc.distance_radii
-    seen, sr = _rays(light, places.reshape(-1, 2))
-    directions = seen @ light.icrs_to_image
+    disc = light.disc
+    px_per_rad = light.camera.scales_px_rad()[0]
+    sigma_px = max(light.psf.variance_px2) ** 0.5
+    shape = places.shape[:-1]
+    distance = disc.distance_radii
+    rays, sr = _rays(light, places.reshape(-1, 2))
+    directions = rays @ light.icrs_to_image
     on_sphere = directions @ disc.to_sphere.T
     impact = disc.impact(directions).reshape(shape)
     face = (disc.radiance(directions) * sr * light.times).reshape(shape)
@@ -220,12 +217,10 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     is_inside = _all((impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)) & ~beside
     is_inside[..., 1:-1, 1:-1] &= _even(lit)
     is_face = _all(SMOOTH * face * (1 - inside**2) ** 1.5 >= most * lit) & is_inside
-    is_air, touched, hidden, spread = (
-        np.zeros_like(is_face),
-        np.zeros_like(face),
-        np.zeros_like(face),
-        0.0,
-    )
+    is_air = np.zeros_like(is_face)
+    touched = np.zeros_like(face)
+    hidden = np.zeros_like(face)
+    spread = 0.0
     if disc.air is not None and distance > 1:
         touched = (disc.touched_light(directions) * sr * light.times).reshape(shape)
         hidden = -np.expm1(
@@ -244,7 +239,8 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
             is_air[..., 1:-1, 1:-1] &= _even(touched > 0)
     of_face = np.concatenate([places, face[..., None], np.ones((*shape, 3))], axis=-1)
     of_air = np.concatenate([places, touched[..., None], on_sphere.reshape(*shape, 3)], axis=-1)
-    e_per_s, inner = np.where(impact < 1, face, touched * hidden), (..., slice(1, -1), slice(1, -1))
+    e_per_s = np.where(impact < 1, face, touched * hidden)
+    inner = (..., slice(1, -1), slice(1, -1))
     masks = is_face[inner], is_inside[inner], is_air[inner], beside[inner]
     return _Lattice(of_face[*inner, :], of_air[*inner, :], e_per_s[inner], *masks, spread)
 
@@ -255,13 +251,13 @@ def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]
     """
     x_px, y_px = places.T - 0.5
     u, v = light.camera.tangents(x_px, y_px)
-    seen = np.stack([u, v, np.ones_like(u)], axis=1)
+    rays = np.stack([u, v, np.ones_like(u)], axis=1)
     if light.shear is not None:
-        seen += light.shear.late_s(x_px, y_px)[:, None] * np.cross(
-            light.shear.rate_image_rad_s, seen
+        rays += light.shear.late_s(x_px, y_px)[:, None] * np.cross(
+            light.shear.rate_image_rad_s, rays
         )
     a, b, c, d = light.camera.slopes(u, v)
-    return seen, 1 / ((a * d - b * c) * np.linalg.norm(seen, axis=1) ** 3)
+    return rays, 1 / ((a * d - b * c) * np.linalg.norm(rays, axis=1) ** 3)
 
 
 def _all(nodes: BoolArray) -> BoolArray:
@@ -283,10 +279,9 @@ def _corners(nodes: FloatArray, tiles: BoolArray) -> Float32Array:
     if not tiles.any():
         return NOTHING
     size = nodes.shape[-3] - 1, nodes.shape[-2] - 1
-    parts = [
-        nodes[..., row : row + size[0], column : column + size[1], :][tiles]
-        for row, column in CORNERS
-    ]
+    parts = []
+    for row, column in CORNERS:
+        parts.append(nodes[..., row : row + size[0], column : column + size[1], :][tiles])
     return np.stack(parts, axis=-2).reshape(-1, 6).astype(np.float32)
 
 
@@ -297,12 +292,14 @@ def _runs(x: IntArray, y: IntArray, tiles: BoolArray) -> Float32Array:
     row, begin = np.nonzero(np.diff(tiles, axis=1, prepend=False) & tiles)
     end = np.nonzero(np.diff(tiles, axis=1, append=False) & tiles)[1] + 1
     order = np.lexsort((row, end, begin))
-    row, begin, end = row[order], begin[order], end[order]
+    row = row[order]
+    begin = begin[order]
+    end = end[order]
     goes_on = (np.diff(begin) == 0) & (np.diff(end) == 0) & (np.diff(row) == 1)
-    first, last = np.append(True, ~goes_on)[: len(row)], np.append(~goes_on, True)[: len(row)]
+    first = np.append(True, ~goes_on)[: len(row)]
+    last = np.append(~goes_on, True)[: len(row)]
     sides = (y[row[first]], y[row[last] + 1]), (x[begin[first]], x[end[first]])
-    places = [
-        np.stack([sides[1][k], sides[0][j], *[np.zeros(first.sum())] * 4], axis=-1)
-        for j, k in CORNERS
-    ]
+    places = []
+    for j, k in CORNERS:
+        places.append(np.stack([sides[1][k], sides[0][j], *[np.zeros(first.sum())] * 4], axis=-1))
     return np.stack(places, axis=-2).reshape(-1, 6).astype(np.float32)

@@ -129,7 +129,9 @@ class Driver:
         errors: list[str] = []
         while len(errors) < MAX_ERRORS and (error := self._error()):
             errors.append(ERRORS.get(error, f"{error:#x}"))
-        return f"the GL driver reports {', '.join(dict.fromkeys(errors))}" if errors else ""
+        if errors:
+            return f"the GL driver reports {', '.join(dict.fromkeys(errors))}"
+        return ""
 
     def check(self) -> None:
         """Raise GpuError where the GPU is not well."""

@@ -111,10 +111,10 @@ def set_planes(
     """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop what
     it does not need.
     """
-    for name, each in (values | {"places_px": planes.places_px}).items():
+    for name, uniform in (values | {"places_px": planes.places_px}).items():
         if name in program:  # an array ends with its last element that is used
             length = getattr(program[name], "array_length", 1)
-            program[name] = list(each[:length]) if length > 1 else each[0]
+            program[name] = list(uniform[:length]) if length > 1 else uniform[0]
     set_uniforms(program, {"margin_px": planes.margin_px})
 
 
@@ -209,7 +209,8 @@ def most_covered_px(sprites: FrameLight, footprint_px: int, sides: SpriteSides, 
     most = len(sprites) * footprint_px**2
     if not sides or most < few_px:
         return most
-    rates, larger_px = np.ascontiguousarray(sprites.data["electrons_per_s"]), footprint_px
+    rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
+    larger_px = footprint_px
     for side in sides:
         smaller = int(np.count_nonzero(rates < side.below_e_per_s / sprites.per_star))
         most -= smaller * (larger_px**2 - side.side_px**2)
@@ -228,9 +229,13 @@ class Eraser:
     def __init__(
         self, ctx: moderngl.Context, size_px: tuple[int, int], planes: Planes, of_levels: bool
     ) -> None:
-        self._ctx, self._planes = ctx, planes
+        self._ctx = ctx
+        self._planes = planes
         self._size_px = size_px
-        on_processor = MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT
+        if of_levels:
+            on_processor = MAX_ERASED_LEVELS
+        else:
+            on_processor = MAX_ERASED_LIGHT
         self._most_px = (
             size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
         )
@@ -320,7 +325,8 @@ class LevelTexture:
         self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes
     ) -> None:
         width, height = resolution_px
-        kind, self._components = level_dtype(planes.panels[0].response), planes.texel
+        kind = level_dtype(planes.panels[0].response)
+        self._components = planes.texel
         shape = height, width, planes.texel
         made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
         self.image, self.memory = pinned(ctx, shape, kind) if shares_memory(ctx) else made
@@ -378,7 +384,8 @@ class LookupTable:
     ) -> None:
         rows = table_rows(values, ctx)
         self.define = [] if rows is None else [f"{name} {len(rows)}"]
-        self._binding, self._in_block = binding, rows is not None
+        self._binding = binding
+        self._in_block = rows is not None
         self.buffer = ctx.buffer((values if rows is None else rows).tobytes())
 
     def bind(self) -> None:
@@ -391,7 +398,7 @@ class LookupTable:
 
 def joined(tables: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], list[int]]:
     """The tables of all planes end to end, and where each begins."""
-    return np.concatenate(tables), [0, *np.cumsum([len(one) for one in tables])[:-1].tolist()]
+    return np.concatenate(tables), [0, *np.cumsum([len(table) for table in tables])[:-1].tolist()]
 
 
 def level_steps(
@@ -400,16 +407,24 @@ def level_steps(
     """The table of levels.glsl for planes that count these edges, and its `bins`; None where a
     bin has several thresholds.
     """
-    tables = [code_table(one) for one in edges]
-    steps = [words for table in tables if (words := table.steps()) is not None]
+    tables = [code_table(table_edges) for table_edges in edges]
+    steps = [table_steps for table in tables if (table_steps := table.steps()) is not None]
     if len(steps) < len(tables):
         return None
-    found, begins = joined(steps)
+    joined_steps, begins = joined(steps)
     bins = []
-    for one, begin in zip(tables, begins, strict=True):
-        first, end = one.first_bin - 1, one.first_bin + len(one.first_code)
-        bins.append((first << one.bin_shift, (end << one.bin_shift) - 1, one.bin_shift, begin))
-    return found, bins
+    for table_edges, begin in zip(tables, begins, strict=True):
+        first = table_edges.first_bin - 1
+        end = table_edges.first_bin + len(table_edges.first_code)
+        bins.append(
+            (
+                first << table_edges.bin_shift,
+                (end << table_edges.bin_shift) - 1,
+                table_edges.bin_shift,
+                begin,
+            )
+        )
+    return joined_steps, bins
 
 
 class Encoder:
@@ -428,44 +443,57 @@ class Encoder:
         planes: Planes,
         quantiser: type[PixelQuantiser],
     ) -> None:
-        self._ctx, self._planes = ctx, planes
+        self._ctx = ctx
+        self._planes = planes
         self._fbo = levels.fbo
         self._size_px = linear.size
         self._footprint_px = 0
-        gain, rises = planes.panels[0].gain(), quantiser.shader
+        gain = planes.panels[0].gain()
+        rises = quantiser.shader
         defines = [*planes.defines, *["RISES"] * bool(rises), *["UNIFORMITY"] * (gain is not None)]
         edges = [quantiser.edges_e_per_s(panel) for panel in planes.panels]
         table = level_steps(edges)
-        steps = None if table is None else table_rows(table[0], ctx)
+        if table is None:
+            steps = None
+        else:
+            steps = table_rows(table[0], ctx)
         defines += [] if table is None else [f"STEPS {0 if steps is None else len(steps)}"]
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
         of_image = [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
         last = ["levels.glsl"] * (table is not None) + [rises] * bool(rises)
         self._built = partial(build_program, ctx, fragment="encode.frag", last=last)
-        self._defines, self._of_image = tuple(defines), tuple(of_image)
+        self._defines = tuple(defines)
+        self._of_image = tuple(of_image)
         self._sprite_vao: moderngl.VertexArray | None = None
         self._white = planes.panels[0].response.white
         self._textures = {"linear_e_per_s": linear}
         thresholds, first = joined(edges)
-        counts = [(begin, len(one)) for begin, one in zip(first, edges, strict=True)]
+        counts = [
+            (begin, len(buffer_data)) for begin, buffer_data in zip(first, edges, strict=True)
+        ]
         rows = table_rows(thresholds, ctx) if rises else None
         self._blocks = {
-            place: ctx.buffer(one.tobytes())
-            for place, one in enumerate((steps, rows))
-            if one is not None
+            place: ctx.buffer(buffer_data.tobytes())
+            for place, buffer_data in enumerate((steps, rows))
+            if buffer_data is not None
         }
         if rows is not None:
             self._defines = (*self._defines, f"EDGES {len(rows)}")
         elif table is None or rises:
             self._textures["threshold_e_per_s"] = self._texture(_rows(thresholds))
         if table is None:
-            tables = [code_table(one) for one in edges]
-            codes, begins = joined([one.first_code for one in tables])
+            tables = [code_table(buffer_data) for buffer_data in edges]
+            codes, begins = joined([buffer_data.first_code for buffer_data in tables])
             self._textures["first_code"] = self._texture(_rows(codes))
-            each = zip(tables, begins, strict=True)
+            tables_and_begins = zip(tables, begins, strict=True)
             bins = [
-                (one.first_bin, len(one.first_code) - 1, one.bin_shift, begin)
-                for one, begin in each
+                (
+                    buffer_data.first_bin,
+                    len(buffer_data.first_code) - 1,
+                    buffer_data.bin_shift,
+                    begin,
+                )
+                for buffer_data, begin in tables_and_begins
             ]
         else:
             bins = table[1]
@@ -542,9 +570,11 @@ class Encoder:
         `is_black` says that the levels were erased before.
         """
         width, height = self._size_px
-        whole, regions = (0, 0, width, height), regions if tiles is None else ()
+        whole = (0, 0, width, height)
+        regions = regions if tiles is None else ()
         if covered_px * SPRITE_PIXEL_COST >= width * height or whole in regions:
-            regions, count = (whole,), 0
+            regions = (whole,)
+            count = 0
         self._fbo.use()
         if not is_black and whole not in regions:
             self._fbo.clear()

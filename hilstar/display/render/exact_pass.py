@@ -58,7 +58,8 @@ class PixelSums:
 
     def __init__(self, planes: Planes, levels: LevelTexture) -> None:
         ctx = levels.texture.ctx
-        self._planes, self._levels = planes, levels
+        self._planes = planes
+        self._levels = levels
         count = math.prod(levels.texture.size) * len(planes.panels)
         self.values, self._memory = pinned(ctx, (count,), np.int32)
         self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
@@ -70,7 +71,8 @@ class PixelSums:
     ) -> None:
         """Take the sprites of a frame, the units of its sums, and the floor that it stands on."""
         write(self.sprites, sprites.data)
-        self._unit_e_per_s, self.floor = unit_e_per_s, floor
+        self._unit_e_per_s = unit_e_per_s
+        self.floor = floor
 
     def bind(self, program: moderngl.ComputeShader) -> None:
         """Let a program look at the sums (see shaders/sums.glsl) and change levels."""
@@ -104,9 +106,12 @@ class ExactPass:
         ctx = self._ctx = linear.ctx
         self.plane, self._makes_up, self._kept = turn
         panel = planes.panels[self.plane]
-        self._planes, self._together = planes, left
+        self._planes = planes
+        self._together = left
         balance = Balance(target.psf, target.seen, quantiser.weights)
-        self._linear, self._levels, self._level_defines = linear, levels.texture, levels.defines
+        self._linear = linear
+        self._levels = levels.texture
+        self._level_defines = levels.defines
         self._pixels = PixelOrder(balance.psf)
         self._shares = shares
         light = panel.light_e_per_s()
@@ -121,7 +126,9 @@ class ExactPass:
         self._memory = Memory(ctx) if quantiser.remembers else None
         self._step_e_per_s = float(light[1])
         self._turns = ctx.buffer(reserve=4, dynamic=True)
-        self._quantiser, self._panel, self._balance = quantiser, panel, balance
+        self._quantiser = quantiser
+        self._panel = panel
+        self._balance = balance
         self._programs: dict[tuple[bool, bool, bool], moderngl.ComputeShader] = {}
 
     def _program(self, paths: bool, summed: bool, floor: bool) -> moderngl.ComputeShader:
@@ -130,12 +137,10 @@ class ExactPass:
         """
         if (paths, summed, floor) in self._programs:
             return self._programs[paths, summed, floor]
-        order, panel, balance, together = (
-            self._pixels,
-            self._panel,
-            self._balance,
-            self._together is not None and not paths,
-        )
+        order = self._pixels
+        panel = self._panel
+        balance = self._balance
+        together = self._together is not None and not paths
         defines = [
             f"NEAR {order.near}",
             *self._level_defines,
@@ -153,7 +158,8 @@ class ExactPass:
             *self._order.define,
             *self._light.define,
         ]
-        narrow, uneven = min(balance.psf.width_px) < NARROW_PX, self._gain is not None
+        narrow = min(balance.psf.width_px) < NARROW_PX
+        uneven = self._gain is not None
         whether = {
             "MAKES_UP": any(self._makes_up),
             "LEAVES": self._kept == KEPT_BEFORE,
@@ -172,7 +178,8 @@ class ExactPass:
         program = build_compute(self._ctx, self._quantiser.shader, defines, files)
         self._shares.set(program)
         set_planes(self._planes, program, makes_up=self._makes_up)
-        window, weights = balance.window_px, balance.weights
+        window = balance.window_px
+        weights = balance.weights
         values: dict[str, Any] = {
             "footprint": order.size**2,
             "overrated": overrated(balance.psf.width_px) if paths else OVERRATED,
@@ -207,7 +214,9 @@ class ExactPass:
         """The errors of the last frame of `temporal`; None at the beginning of a sequence.
         NumPy's quantiser may give them.
         """
-        return None if self._memory is None else self._memory.left
+        if self._memory is None:
+            return None
+        return self._memory.left
 
     @left.setter
     def left(self, left: Left | None) -> None:

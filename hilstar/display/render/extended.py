@@ -41,7 +41,9 @@ class ExtendedLayer:
         Where a frame is `sure` of its levels and a disc alone is on the image, what its `Tiles`
         have as levels is left out.
         """
-        ctx, regions, found = self._ctx, [], None
+        ctx = self._ctx
+        regions = []
+        sure_tiles = None
         on_image = [
             (light, region)
             for light in lights
@@ -54,22 +56,26 @@ class ExtendedLayer:
         # behind it.
         ctx.blend_func = (moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
         for light, region in on_image:
-            tiles = disc_tiles(light, region, sure) if isinstance(light, DiscLight) else None
+            if isinstance(light, DiscLight):
+                tiles = disc_tiles(light, region, sure)
+            else:
+                tiles = None
             if isinstance(light, DiscLight) and tiles is not None:
                 region = tiles.region
                 if not region[2]:
                     continue
-                fbo.viewport, fbo.scissor = (0, 0, *self._resolution_px), region
+                fbo.viewport = (0, 0, *self._resolution_px)
+                fbo.scissor = region
                 self._draw_tiles(light, tiles)
                 fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
-                found = tiles if sure is not None else None
+                sure_tiles = tiles if sure is not None else None
             else:
                 fbo.viewport = region
                 self._draw_one(light)
             regions.append(region)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
         ctx.disable(moderngl.BLEND)
-        return tuple(regions), found
+        return tuple(regions), sure_tiles
 
     def _draw_one(self, light: ExtendedLight) -> None:
         if isinstance(light, LightMap):
@@ -90,20 +96,21 @@ class ExtendedLayer:
         program, triangle = self._program(
             "light_map.frag", (), *(() if light.cover is None else ("COVER",))
         )
-        own = []
+        textures = []
         for unit, image in enumerate((light.image, light.cover)):
             if image is not None:
-                texture = (
-                    self._texture(image, image, 1) if light.lasting else self._upload(image, 1)
-                )
+                if light.lasting:
+                    texture = self._texture(image, image, 1)
+                else:
+                    texture = self._upload(image, 1)
                 texture.use(unit)
-                own += [] if light.lasting else [texture]
+                textures += [] if light.lasting else [texture]
         if light.cover is not None:
             program["cover"] = 1
         program["corner_px"] = light.corner_px
         program["times"] = light.times
         triangle.render(moderngl.TRIANGLES, vertices=3)
-        for texture in own:
+        for texture in textures:
             texture.release()
 
     def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
@@ -154,16 +161,16 @@ class ExtendedLayer:
         """The float32 texture of an array, or of a camera's ray shifts; kept while its owner is
         used.
         """
-        kept = self._textures.pop(id(owner), None)
-        if kept is None:
+        cached = self._textures.pop(id(owner), None)
+        if cached is None:
             if len(self._textures) >= KEPT_TEXTURES:
                 self._textures.pop(next(iter(self._textures)))[1].release()
-            kept = (
+            cached = (
                 owner,
                 self._upload(ray_shifts(owner) if isinstance(owner, Camera) else image, components),
             )
-        self._textures[id(owner)] = kept  # the last used is the last to go
-        return kept[1]
+        self._textures[id(owner)] = cached  # the last used is the last to go
+        return cached[1]
 
     def forget(self) -> None:
         """Upload what is kept on the GPU again when it is next drawn."""
@@ -180,7 +187,8 @@ class ExtendedLayer:
 
 def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
     """The body, its face, the turn and the Gaussian, in a program of disc.frag."""
-    disc, shear = light.disc, light.shear
+    disc = light.disc
+    shear = light.shear
     from_image, (place, weight) = disc.to_sphere @ light.icrs_to_image.T, gauss_legendre(NODES)
     values = {
         "to_sphere": tuple(from_image.T.ravel().tolist()),  # column by column

@@ -48,16 +48,17 @@ class LightUnits:
     def __init__(
         self, planes: Planes, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()
     ) -> None:
-        self.planes, self.size_px, self.psf = planes, size_px, psf
-        panel, self._share = planes.lit, planes.share
+        self.planes = planes
+        self.size_px = size_px
+        self.psf = psf
+        panel = planes.lit
+        self._share = planes.share
         self._footprint_px = planes.footprint_px
         gain = panel.gain()
         low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
-        self.lit_e_per_s, self._white_e_per_s = (
-            float(thresholds[0]) / high,
-            panel.flux_at_white_e_per_s / low,
-        )
+        self.lit_e_per_s = float(thresholds[0]) / high
+        self._white_e_per_s = panel.flux_at_white_e_per_s / low
         self.most_e_per_s = [self._white_e_per_s * share for share in planes.share]
         self._peak_share = psf.peak_share
         self.axes_px2, self._share_bound = psf.reach
@@ -106,9 +107,10 @@ class LightUnits:
 
         Of one that stands `alone` no pixel beyond it is lit.
         """
-        denser = (
-            DENSER_WINGS if len(sprites) * self._footprint_px**2 > math.prod(self.size_px) else 1
-        )
+        if len(sprites) * self._footprint_px**2 > math.prod(self.size_px):
+            denser = DENSER_WINGS
+        else:
+            denser = 1
         return (
             self._share_bound
             * sprites.per_star

@@ -116,7 +116,8 @@ class NumpyBackend(Backend):
         if frame <= self._last_frame:
             self.begin_anew()
         self._last_frame = frame
-        self._sprites, self._linear = sprites, None
+        self._sprites = sprites
+        self._linear = None
         if self._stars is not None and self._draws_stars_alone(self._stars, sprites):
             return
         if self._quantisers:
@@ -124,11 +125,13 @@ class NumpyBackend(Backend):
 
     def _build_stars(self) -> None:
         """Make what draws the nearest levels of frames of stars alone."""
-        target, planes = self.target, self._planes
+        target = self.target
+        planes = self._planes
         units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         shape = *target.resolution_px[::-1], len(planes.panels)
         self._level_image = np.zeros(shape, dtype=level_dtype(planes.panels[0].response))
-        self._stars, self._units = CpuStars(units, self._level_image), units
+        self._stars = CpuStars(units, self._level_image)
+        self._units = units
 
     def _draws_stars_alone(self, stars: CpuStars, sprites: FrameLight | None) -> bool:
         """Whether the levels of a frame are those of stars alone, which are drawn then."""
@@ -145,15 +148,14 @@ class NumpyBackend(Backend):
         return True
 
     def _plane(self, frame: int, k: int, light: FrameLight | None) -> Levels:
-        image, alone = (
-            partial(self._image, light, True, k),
-            partial(self._image, light, False, k, stars=False),
-        )
+        image = partial(self._image, light, True, k)
+        alone = partial(self._image, light, False, k, stars=False)
         return self._quantisers[k].draw(UnquantisedFrame(light, image, alone, frame))
 
     def draw_linear(self, sprites: FrameLight) -> None:
         """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
-        self._sprites, self._linear = sprites, None
+        self._sprites = sprites
+        self._linear = None
 
     def linear(self) -> Float32Array:
         """The linear image of the last draw, electrons per second, float32 (height, width)."""
@@ -180,7 +182,8 @@ class NumpyBackend(Backend):
         view = self._screen
         turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
         shown = self.levels()[:height, :width]
-        shown = shown if view.triples is None else view.triples[shown]
+        if view.triples is not None:
+            shown = view.triples[shown]
         codes = np.zeros((height, width, 3), dtype=np.uint16)
         codes[: shown.shape[0], : shown.shape[1]] = shown if shown.ndim == 3 else shown[..., None]
         cross_x, cross_y = map(round, view.cross_px)
@@ -202,8 +205,8 @@ class NumpyBackend(Backend):
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
         self._last_frame = NO_FRAME
-        for one in self._quantisers.values():
-            one.begin_anew()
+        for quantiser in self._quantisers.values():
+            quantiser.begin_anew()
 
     def finish(self) -> None:
         """Return at once: `draw` has drawn."""
@@ -218,16 +221,24 @@ class NumpyBackend(Backend):
         within the target's `sides`.
         """
         width, height = self.target.resolution_px
-        sprites = as_maps(sprites, self.target) if stars else sprites
+        if stars:
+            sprites = as_maps(sprites, self.target)
         zeros = np.zeros((height, width), dtype=np.float32)
         if sprites is None:
             return zeros
-        extended = self._extended(sprites.extended, plane) if sprites.extended else None
+        if sprites.extended:
+            extended = self._extended(sprites.extended, plane)
+        else:
+            extended = None
         if not stars:
-            return zeros if extended is None else extended.astype(np.float32)
+            if extended is None:
+                return zeros
+            return extended.astype(np.float32)
         self._image_of_stars.draw(sprites, self._sides_px(sprites, shrunk, plane))
         image = self._image_of_stars.image
-        return image if extended is None else (image + extended).astype(np.float32)
+        if extended is None:
+            return image
+        return (image + extended).astype(np.float32)
 
     def _sides_px(self, sprites: FrameLight, shrunk: bool, plane: int) -> IntArray:
         """The sides (n,) of the squares of sprites."""

@@ -58,7 +58,8 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
         [np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()]
     )
     width, height = screen_px
-    wrong, first = 0, ""
+    wrong = 0
+    first = ""
     for part in np.array_split(triples, -(-len(triples) // min(MAX_LEVELS, width * height))):
         levels = (
             (np.arange(width * height, dtype=np.uint32) % len(part))
@@ -81,7 +82,9 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             became = drawn[(levels == changed[0]) & differ][0].astype(int)
             first = f"{tuple(map(int, part[changed[0]]))} as {tuple(map(int, became))}"
         wrong += len(changed)
-    return f"{wrong} of {len(triples)} codes are not drawn as they are, {first}" if wrong else ""
+    if wrong:
+        return f"{wrong} of {len(triples)} codes are not drawn as they are, {first}"
+    return ""
 
 
 class Presenter:
@@ -91,7 +94,8 @@ class Presenter:
     """
 
     def __init__(self, levels: moderngl.Texture, view: ScreenView, apart: bool = False) -> None:
-        self._texture, self._apart = levels, apart
+        self._texture = levels
+        self._apart = apart
         self._ctx = levels.ctx
         self._view = view
         with self._ctx:
@@ -105,7 +109,8 @@ class Presenter:
         """The program without or with crosshair, grid, blank and patch, for this orientation
         alone.
         """
-        view, orientation = self._view, self._view.orientation
+        view = self._view
+        orientation = self._view.orientation
         flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
         wanted = flips | {"STEALING": view.triples is not None, "APART": self._apart, "AIDS": aids}
         defines = (
@@ -126,7 +131,10 @@ class Presenter:
 
     def set_triples(self, triples: npt.NDArray[np.uint16] | None) -> None:
         """Use other codes for the same levels."""
-        used = np.zeros((1, 3), dtype=np.uint16) if triples is None else triples
+        if triples is None:
+            used = np.zeros((1, 3), dtype=np.uint16)
+        else:
+            used = triples
         rows = -(-len(used) // TABLE_WIDTH)
         padded = np.zeros((rows, TABLE_WIDTH, 3), dtype=np.uint16)
         padded.reshape(-1, 3)[: len(used)] = used

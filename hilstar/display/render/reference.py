@@ -66,7 +66,9 @@ def add_stars(
     """
     height, width = image.shape
     steps = np.arange(side_px) - (side_px - 1) // 2
-    data, x_px, y_px = sprites.data[some], sprites.x_px[some], sprites.y_px[some]
+    data = sprites.data[some]
+    x_px = sprites.x_px[some]
+    y_px = sprites.y_px[some]
     at_once = max(1, MAX_AT_ONCE_PX // side_px**2)
     for begin in range(0, len(data), at_once):
         part = slice(begin, begin + at_once)
@@ -75,7 +77,8 @@ def add_stars(
             (columns - x_px[part, None])[:, None, :], (rows - y_px[part, None])[:, :, None]
         )
         light = share * data["electrons_per_s"][part, None, None].astype(np.float64) * of_pixels
-        on_x, on_y = (columns >= 0) & (columns < width), (rows >= 0) & (rows < height)
+        on_x = (columns >= 0) & (columns < width)
+        on_y = (rows >= 0) & (rows < height)
         inside = on_y[:, :, None] & on_x[:, None, :]
         places = rows[:, :, None].astype(np.intp) * width + columns[:, None, :]
         np.add.at(image.reshape(-1), places[inside], light[inside])
@@ -85,9 +88,9 @@ def _glow(light: GlowLight, region: Rectangle) -> FloatArray:
     left, top, width, height = region
     y, x = np.mgrid[top : top + height, left : left + width].astype(np.float64)
     u, v = light.camera.tangents(x.ravel(), y.ravel())
-    seen = np.stack([u, v, np.ones_like(u)], axis=1)
+    rays = np.stack([u, v, np.ones_like(u)], axis=1)
     angle = np.arctan2(
-        np.linalg.norm(np.cross(light.direction_image, seen), axis=1), seen @ light.direction_image
+        np.linalg.norm(np.cross(light.direction_image, rays), axis=1), rays @ light.direction_image
     )
     profile = (1 + (angle / light.scale_rad) ** 2) ** (-light.exponent / 2)
     return np.asarray(light.peak_e_per_s * profile.reshape(height, width))
@@ -110,14 +113,14 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
         [_rays(light, columns, rows[k : k + at_once]) for k in range(0, len(rows), at_once)], axis=1
     )
     sigma = [RAYS_ACROSS * width_px for width_px in reversed(light.psf.width_px)]
-    found = []
+    parts = []
     for part in sharp:
         fine = gaussian_filter(part, sigma, mode="nearest", truncate=REACH_SIGMAS)
         whole = fine.reshape(
             height + 2 * margin, RAYS_ACROSS, width + 2 * margin, RAYS_ACROSS
         ).mean(axis=(1, 3))
-        found.append(whole[margin : margin + height, margin : margin + width])
-    return light.times * found[0], light.covers * found[1]
+        parts.append(whole[margin : margin + height, margin : margin + width])
+    return light.times * parts[0], light.covers * parts[1]
 
 
 def _rays(light: DiscLight, columns_px: FloatArray, rows_px: FloatArray) -> FloatArray:
@@ -127,11 +130,11 @@ def _rays(light: DiscLight, columns_px: FloatArray, rows_px: FloatArray) -> Floa
     camera = light.camera
     x_px, y_px = (part.ravel() for part in np.meshgrid(columns_px, rows_px))
     u, v = camera.tangents(x_px, y_px)
-    seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
+    rays = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
     if light.shear is not None:
         late_s = light.shear.late_s(x_px, y_px)
-        seen = seen + late_s[:, None] * np.cross(light.shear.rate_image_rad_s, seen)
-    a, b, c, d = camera.slopes(seen[:, 0], seen[:, 1])
-    sr = np.nan_to_num(1 / (a * d - b * c)) / np.linalg.norm(seen, axis=1) ** 3
-    radiance, cover = light.disc.with_air(seen @ light.icrs_to_image)
+        rays = rays + late_s[:, None] * np.cross(light.shear.rate_image_rad_s, rays)
+    a, b, c, d = camera.slopes(rays[:, 0], rays[:, 1])
+    sr = np.nan_to_num(1 / (a * d - b * c)) / np.linalg.norm(rays, axis=1) ** 3
+    radiance, cover = light.disc.with_air(rays @ light.icrs_to_image)
     return np.stack([radiance * sr, cover]).reshape(2, len(rows_px), len(columns_px))

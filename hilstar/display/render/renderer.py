@@ -87,7 +87,10 @@ class Renderer(Backend):
             with self._ctx:
                 self._driver = Driver(self._ctx)
                 self._uses_cpu = self.MAY_USE_CPU and draws_by_cpu(self._ctx)
-                key = "sprite_sigma_px" if target.response else "psf_sigma_px"
+                if target.response:
+                    key = "sprite_sigma_px"
+                else:
+                    key = "psf_sigma_px"
                 check_limits(
                     self._ctx,
                     target.resolution_px,
@@ -100,7 +103,9 @@ class Renderer(Backend):
             raise
 
     def _build(self) -> None:
-        ctx, target, planes = self._ctx, self.target, self._planes
+        ctx = self._ctx
+        target = self.target
+        planes = self._planes
         ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
         self._linear = ctx.texture(target.resolution_px, planes.texel, dtype="f4")
@@ -200,7 +205,8 @@ class Renderer(Backend):
 
         `exact` takes the sums of both from memory that the GL shares; where it shares none, points.
         """
-        target, planes = self.target, self._planes
+        target = self.target
+        planes = self._planes
         units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         if self._uses_cpu and not self._exact_passes:
             self._cpu_stars = CpuStars(units, levels.image)
@@ -239,7 +245,8 @@ class Renderer(Backend):
             if frame <= self._last_frame:
                 self.begin_anew()
             self._last_frame = frame
-            stars, by_star = self._cpu_stars, self._by_star
+            stars = self._cpu_stars
+            by_star = self._by_star
             if by_star is None or self._exact_passes:
                 sprites = as_maps(sprites, self.target)
             extended = sprites is not None and bool(sprites.extended)
@@ -247,7 +254,10 @@ class Renderer(Backend):
             on_floor = extended and by_star is not None
             in_units = not extended or (on_floor and stars is not None and not self._planes.apart)
             units = self._units if in_units else None
-            unit_e_per_s = None if units is None else units.unit_for(sprites)
+            if units is None:
+                unit_e_per_s = None
+            else:
+                unit_e_per_s = units.unit_for(sprites)
             self._by_numpy = by_star is not None and (
                 not self._exact_passes or (on_floor and unit_e_per_s is None)
             )
@@ -278,7 +288,8 @@ class Renderer(Backend):
         floor: LevelTexture | None,
     ) -> None:
         """Levels star by star; the linear image is drawn only when it is read."""
-        self._undrawn, self._levels_black = (sprites, True), False
+        self._undrawn = (sprites, True)
+        self._levels_black = False
         with self._stage("erase"):
             stars.lay(None if floor is None else floor.read())
         if self._levels is not None:
@@ -325,32 +336,38 @@ class Renderer(Backend):
         self._last_frame = NO_FRAME
         for quantiser in self._exact.values():
             quantiser.left = None
-        for one in self._exact_passes:
-            one.left = None
+        for exact_pass in self._exact_passes:
+            exact_pass.left = None
 
     def _draw_by_points(self, sprites: FrameLight | None, unit_e_per_s: list[float] | None) -> None:
         """The linear image and its levels by rasterised sprites, in units where one is given."""
         few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
-        sides = self._lit_sides if self._encoder is not None else ()
-        covered_px = (
-            0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
-        )
-        units, encoder, splat = self._units, self._encoder, self._unit_splat
+        if self._encoder is not None:
+            sides = self._lit_sides
+        else:
+            sides = ()
+        if sprites is None:
+            covered_px = 0
+        else:
+            covered_px = most_covered_px(sprites, self.footprint_px, sides, few_px)
+        units = self._units
+        encoder = self._encoder
+        splat = self._unit_splat
         in_units = sprites is not None and unit_e_per_s is not None and splat is not None
         if units is not None and encoder is not None and splat is not None:
-            reach_per_e = (
-                0.0 if sprites is None or unit_e_per_s is None else units.reach_per_e(sprites)
-            )
+            if sprites is None or unit_e_per_s is None:
+                reach_per_e = 0.0
+            else:
+                reach_per_e = units.reach_per_e(sprites)
             encoder.sprite_program["reach_per_e"] = reach_per_e
             if in_units and unit_e_per_s is not None:
                 splat["reach_per_e"] = reach_per_e
                 set_planes(self._planes, splat, unit_e_per_s=unit_e_per_s)
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
-        sure = (
-            None
-            if sprites is None or not sprites.extended or covered_px >= few_px
-            else self._sure(self._by_pixel, sprites)
-        )
+        if sprites is None or not sprites.extended or covered_px >= few_px:
+            sure = None
+        else:
+            sure = self._sure(self._by_pixel, sprites)
         self._draw_linear(
             sprites, whole=not (self.target.sides or cut), in_units=in_units, sure=sure
         )
@@ -375,14 +392,14 @@ class Renderer(Backend):
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last
         frame left.
         """
-        for one in self._exact_passes:
-            if self._exact and (left := self._exact[one.plane].left) is not None:
-                one.left, self._exact[one.plane].left = left, None
+        for exact_pass in self._exact_passes:
+            if self._exact and (remainder := self._exact[exact_pass.plane].left) is not None:
+                exact_pass.left, self._exact[exact_pass.plane].left = remainder, None
             if sprites is None or not len(sprites):
-                one.left = None
+                exact_pass.left = None
                 continue
             with self._stage("choose"):
-                one.draw(self._buffer if sums is None else sums.sprites, sprites, sums)
+                exact_pass.draw(self._buffer if sums is None else sums.sprites, sprites, sums)
 
     def _draw_by_numpy(self, sprites: FrameLight | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
@@ -446,12 +463,16 @@ class Renderer(Backend):
         dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(
             panel.response.light[1]
         ) * white_e_per_s / (2 * MASK_TURNS)
-        places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
+        if sprites is None:
+            places_px = np.empty((0, 2), dtype=np.intp)
+        else:
+            places_px = sprites.data["pixel"]
         return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
     def _draw_extended(self, sprites: FrameLight, sure: "Sure | None" = None) -> None:
         """Add extended light to the linear image, that of each primary to its plane alone."""
-        fbo, self._regions = self._linear_fbo, ()
+        fbo = self._linear_fbo
+        self._regions = ()
         for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
             fbo.color_mask = tuple(plane == k or not self._planes.apart for k in range(4))  # type: ignore[assignment]
             regions, self._tiles = self._extended.draw(fbo, lights, sure)
@@ -520,7 +541,8 @@ class Renderer(Backend):
                 self._level_eraser.erase_regions(self._levels.fbo, self._regions)
         self._eraser.erase(self._linear_fbo, self._last_count)
         self._eraser.erase_regions(self._linear_fbo, self._regions)
-        self._regions, self._tiles = (), None
+        self._regions = ()
+        self._tiles = None
         self._last_count = 0
 
     def levels(self) -> Levels:
@@ -602,8 +624,10 @@ class Renderer(Backend):
 
     def forget_images(self) -> None:
         """See `Backend.forget_images`."""
-        self._last_count, self._levels_black = None, False
-        self._floor_encoder, self._floor_levels = None, None
+        self._last_count = None
+        self._levels_black = False
+        self._floor_encoder = None
+        self._floor_levels = None
         with self._ctx:
             if self._cpu_stars is not None:
                 self._forget_cpu(self._cpu_stars)
@@ -632,5 +656,8 @@ class Renderer(Backend):
 
 
 def _checksum(table: moderngl.Texture | moderngl.Buffer) -> int:
-    data = table.read() if isinstance(table, moderngl.Buffer) else table.read(alignment=1)
+    if isinstance(table, moderngl.Buffer):
+        data = table.read()
+    else:
+        data = table.read(alignment=1)
     return zlib.crc32(data)

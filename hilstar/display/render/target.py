@@ -88,9 +88,13 @@ class Planes:
     @classmethod
     def of(cls, target: Target) -> "Planes":
         """Those of a target."""
-        white_e_per_s, panel = target.flux_at_white_e_per_s, target.panel()
+        white_e_per_s = target.flux_at_white_e_per_s
+        panel = target.panel()
         panels = target.primaries or (() if panel is None else (panel,))
-        away = np.abs(np.array(target.places_px)).max(axis=0) if target.primaries else np.zeros(2)
+        if target.primaries:
+            away = np.abs(np.array(target.places_px)).max(axis=0)
+        else:
+            away = np.zeros(2)
         defines = ["APART"] * bool(target.primaries) + ["OFFSETS"] * bool(away.any())
         share = tuple(one.flux_at_white_e_per_s / white_e_per_s for one in panels)
         margin_px = float(away[0]), float(away[1])

@@ -28,9 +28,13 @@ def turns_of(target: Target) -> list[Turn]:
     share = target.together / target.together.diagonal() * step[:, None] / step
     # What a primary leaves has in it what it began with: `errors` (3, 3) are its own errors by
     # what each leaves.
-    errors, turns = np.zeros_like(share), []
+    errors = np.zeros_like(share)
+    turns = []
     for k in order:
-        makes_up = np.zeros(len(panels)) if alone else share[:, k] @ errors
+        if alone:
+            makes_up = np.zeros(len(panels))
+        else:
+            makes_up = share[:, k] @ errors
         errors[k] = -makes_up
         errors[k, k] += 1
         is_last = alone or k == order[-1]
@@ -42,7 +46,8 @@ def quantisers_of(target: Target) -> dict[int, Quantiser]:
     """NumPy's quantiser of each panel, in the order in which they choose; none without a
     response.
     """
-    panel, kind = target.panel(), QUANTISERS[target.quantisation]
+    panel = target.panel()
+    kind = QUANTISERS[target.quantisation]
     panels = target.primaries or (() if panel is None else (panel,))
     turns = turns_of(target) if panels else []
     quantisers = {

@@ -70,7 +70,8 @@ class VariantRenderer(Renderer):
             if variant.profile == "table":
                 # Shares along x and y, the two channels of one row, from a star's centre to past
                 # its footprint's edge
-                reach_px, size = self.footprint_px / 2 + 1, variant.table_size
+                reach_px = self.footprint_px / 2 + 1
+                size = variant.table_size
                 offset_px = np.linspace(0, reach_px, size)
                 shares = np.stack(
                     [pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1

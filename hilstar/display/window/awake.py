@@ -91,7 +91,8 @@ class _Server:
     def blanking(self) -> _Blanking:
         parts = [ctypes.c_int() for _ in range(4)]
         self._x11.XGetScreenSaver(self._display, *(ctypes.byref(part) for part in parts))
-        level, on = ctypes.c_ushort(), ctypes.c_ubyte()
+        level = ctypes.c_ushort()
+        on = ctypes.c_ubyte()
         if self._has_dpms:
             self._xext.DPMSInfo(self._display, ctypes.byref(level), ctypes.byref(on))
         timeout_s, interval_s, prefer, allow = (part.value for part in parts)
@@ -119,15 +120,15 @@ def _keep() -> None:
     """The process: from its first word on nothing blanks, until its stdin ends."""
     server = _Server()
     before: _Blanking | None = None
-    said = False
+    is_reported = False
     while True:
-        found = server.blanking()
-        if found.happens:
-            before = found
-            server.prevent(found)
-        if not said:
+        blanking = server.blanking()
+        if blanking.happens:
+            before = blanking
+            server.prevent(blanking)
+        if not is_reported:
             os.write(1, b".")
-            said = True
+            is_reported = True
         if select.select([0], [], [], LOOK_S)[0]:
             break
     if before is not None and not server.blanking().happens:

@@ -100,7 +100,10 @@ def findings(
     """
     for rule in RULES:
         value = (state.properties or {}).get(rule.name)
-        verdict = RIGHT if value is None else rule.judge(value, bits)
+        if value is None:
+            verdict = RIGHT
+        else:
+            verdict = rule.judge(value, bits)
         if value is not None and verdict != RIGHT:
             mend = rule.mend.format(output=state.name, name=rule.name, bits=bits)
             yield Finding(
@@ -108,13 +111,14 @@ def findings(
                 verdict == WRONG,
             )
     yield from _geometry_findings(state)
-    found = _own_pitch_um(state.edid)
+    edid_pitch_um = _own_pitch_um(state.edid)
     if (
         pixel_pitch_um is not None
-        and found is not None
-        and abs(found[0] - pixel_pitch_um) > PITCH_TOLERANCE * found[0] + found[1]
+        and edid_pitch_um is not None
+        and abs(edid_pitch_um[0] - pixel_pitch_um)
+        > PITCH_TOLERANCE * edid_pitch_um[0] + edid_pitch_um[1]
     ):
-        told = f"{state.name} says by its EDID that its pixels are {found[0]:.1f} um apart"
+        told = f"{state.name} says by its EDID that its pixels are {edid_pitch_um[0]:.1f} um apart"
         text = (
             f"{told} and the bench file says {pixel_pitch_um:g}; measure it, and set [monitor]"
             " pixel_pitch_um"
@@ -165,9 +169,12 @@ def size_mm_of(edid: bytes) -> Pair | None:
     timing = edid[54:72]
     if len(edid) < 128 or len(timing) < 18 or not timing[0] | timing[1]:
         return None
-    width, height = timing[12] | (timing[14] & 0xF0) << 4, timing[13] | (timing[14] & 0x0F) << 8
+    width = timing[12] | (timing[14] & 0xF0) << 4
+    height = timing[13] | (timing[14] & 0x0F) << 8
     # Some write an aspect ratio (16 x 9) there, and televisions nothing.
-    return (width, height) if min(width, height) > 20 else None
+    if min(width, height) > 20:
+        return (width, height)
+    return None
 
 
 def _own_pitch_um(edid: bytes) -> tuple[float, float] | None:
@@ -176,7 +183,8 @@ def _own_pitch_um(edid: bytes) -> tuple[float, float] | None:
     if len(edid) < 128 or not timing[0] | timing[1]:
         return None
     wide_px = timing[2] | (timing[4] & 0xF0) << 4
-    fine, coarse_mm = size_mm_of(edid), 10 * edid[21]
+    fine = size_mm_of(edid)
+    coarse_mm = 10 * edid[21]
     if not wide_px or not (fine or (coarse_mm and edid[22])):
         return None
     wide_mm, rounding_mm = (fine[0], 0.5) if fine else (coarse_mm, CM_ROUNDING_MM)
@@ -184,7 +192,9 @@ def _own_pitch_um(edid: bytes) -> tuple[float, float] | None:
 
 
 def _words(value: Value) -> str:
-    return " ".join(str(part) for part in value) if isinstance(value, tuple) else str(value)
+    if isinstance(value, tuple):
+        return " ".join(str(part) for part in value)
+    return str(value)
 
 
 Judge = Callable[[Value, int], str]
@@ -206,11 +216,16 @@ def _one_of(right: str, doubtful: str = "") -> Judge:
     """Right are these values, separated by commas, in any case; some are doubtful; all others
     are wrong.
     """
-    good, unsure = right.lower().split(","), doubtful.lower().split(",") if doubtful else []
+    good = right.lower().split(",")
+    unsure = doubtful.lower().split(",") if doubtful else []
 
     def judge(value: Value, bits: int) -> str:
         word = str(value).lower()
-        return RIGHT if word in good else DOUBTFUL if word in unsure else WRONG
+        if word in good:
+            return RIGHT
+        if word in unsure:
+            return DOUBTFUL
+        return WRONG
 
     return judge
 

@@ -171,7 +171,8 @@ class Randr(Closing):
     """
 
     def __init__(self, survival: Survival | None = None) -> None:
-        self._x11, self._xrandr = xlib(), load_library(XRANDR_LIBRARY, **XRANDR_FUNCTIONS)
+        self._x11 = xlib()
+        self._xrandr = load_library(XRANDR_LIBRARY, **XRANDR_FUNCTIONS)
         self._display: Any = self._x11.XOpenDisplay(None)
         if not self._display:
             raise OSError("no X server")
@@ -199,11 +200,10 @@ class Randr(Closing):
             modes = {mode.id: mode for mode in resources.modes[: resources.nmode]}
             for number in resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
-                    state = (
-                        None
-                        if output is None or not output.crtc
-                        else self._state(resources, number, output, modes)
-                    )
+                    if output is None or not output.crtc:
+                        state = None
+                    else:
+                        state = self._state(resources, number, output, modes)
                 lit += [] if state is None else [state]
         providers = self._providers()
         names = [state.name for state in lit]
@@ -243,7 +243,8 @@ class Randr(Closing):
         with self._got(_Crtc, self._xrandr.XRRFreeCrtcInfo, crtc) as now:
             if now is None or now.mode not in modes:
                 return None
-            mode, rotated = modes[now.mode], now.rotation != ROTATE_0
+            mode = modes[now.mode]
+            rotated = now.rotation != ROTATE_0
             pixels = mode.sync[2] * mode.sync[6]
         properties = dict(self._properties(number))
         edid = properties.pop("EDID", b"")
@@ -289,8 +290,11 @@ class Randr(Closing):
             self._x11.XFree(ctypes.cast(atoms, POINTER))
 
     def _property(self, output: int, atom: int, raw: bool) -> Value | bytes | None:
-        kind, form = ctypes.c_ulong(), ctypes.c_int()
-        count, rest, data = ctypes.c_ulong(), ctypes.c_ulong(), POINTER()
+        kind = ctypes.c_ulong()
+        form = ctypes.c_int()
+        count = ctypes.c_ulong()
+        rest = ctypes.c_ulong()
+        data = POINTER()
         results = (ctypes.byref(part) for part in (kind, form, count, rest, data))
         failed = self._xrandr.XRRGetOutputProperty(
             self._display, output, atom, 0, MAX_ITEMS, 0, 0, 0, *results
@@ -318,7 +322,10 @@ class Randr(Closing):
     def _providers(self) -> tuple[str, ...]:
         found = self._xrandr.XRRGetProviderResources(self._display, self._root)
         with self._got(_Providers, self._xrandr.XRRFreeProviderResources, found) as providers:
-            numbers = [] if providers is None else providers.ids[: providers.count]
+            if providers is None:
+                numbers = []
+            else:
+                numbers = providers.ids[: providers.count]
         names = []
         with self._resources() as resources:
             for number in () if resources is None else numbers:
@@ -333,20 +340,21 @@ class Randr(Closing):
         """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of
         it.
         """
-        tool = (
-            shutil.which("nvidia-settings") if has_extension(self._display, b"NV-CONTROL") else None
-        )
+        if has_extension(self._display, b"NV-CONTROL"):
+            tool = shutil.which("nvidia-settings")
+        else:
+            tool = None
         values: dict[str, Value] = {}
         for attribute in () if tool is None else NVIDIA_ATTRIBUTES:
             command = [str(tool), "-t", "-q", f"[DPY:{output}]/{attribute}"]
             try:
-                said = subprocess.run(
+                completed = subprocess.run(
                     command, capture_output=True, text=True, timeout=NVIDIA_S, check=False
                 ).stdout.strip()
             except (OSError, subprocess.TimeoutExpired):
                 break
-            if said.removeprefix("-").isdecimal():
-                values[NVIDIA + attribute] = int(said)
+            if completed.removeprefix("-").isdecimal():
+                values[NVIDIA + attribute] = int(completed)
         return values
 
     @contextmanager

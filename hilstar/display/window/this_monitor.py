@@ -28,12 +28,16 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
     where there is none.
     """
     try:
-        display = next(one for one in displays() if one.is_named(wanted))
+        display = next(candidate for candidate in displays() if candidate.is_named(wanted))
     except (MachineError, StopIteration):
         return None
-    edid, ramp, refresh_hz, adds = b"", b"", float(display.refresh_hz), {}
+    edid = b""
+    ramp = b""
+    refresh_hz = float(display.refresh_hz)
+    adds = {}
     with contextlib.suppress(OSError), Randr() as randr:
-        ramp, adds = randr.ramp(display.name), randr.additions()
+        ramp = randr.ramp(display.name)
+        adds = randr.additions()
         for state in randr.outputs():
             if state.name == display.name:
                 edid, refresh_hz, adds["a transform"] = (
@@ -77,19 +81,19 @@ def _by_ddc(edid: bytes) -> dict[str, int]:
         return {}
     command = [program, "getvcp", *VCP, "--terse", "--edid", edid[:EDID_BYTES].hex()]
     try:
-        told = subprocess.run(
+        completed = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=DDC_S, check=False
         ).stdout
     except (OSError, subprocess.TimeoutExpired):
         return {}
-    found = {}
+    settings = {}
     # VCP 10 C 40 100 (now, maximum); VCP 14 SNC x05; VCP C0 CNC x00 xff x04 xb0 (maximum, now)
-    for code, kind, words in re.findall(
-        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", told, re.MULTILINE
+    for code, kind, value_text in re.findall(
+        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", completed, re.MULTILINE
     ):
-        values = words.split()
+        values = value_text.split()
         with contextlib.suppress(ValueError):
-            found[VCP[code]] = (
+            settings[VCP[code]] = (
                 int(values[0]) if kind == "C" else int("".join(values[-2:]).replace("x", ""), 16)
             )
-    return found
+    return settings

@@ -45,7 +45,10 @@ class Visibility:
     """
 
     def __init__(self, x11: Any, connection: int, window: int, place: ScreenArea | None) -> None:
-        self._x11, self._connection, self._window, self.place = x11, connection, window, place
+        self._x11 = x11
+        self._connection = connection
+        self._window = window
+        self.place = place
         self._covered = 0
         self._mapped = self._there = True
         self._asleep = _sleep_of(connection)
@@ -104,23 +107,31 @@ class Visibility:
         where it is.
         """
         root = self._x11.XDefaultRootWindow(self._connection)
-        size, screen = self._geometry(self._window), self._geometry(root)
-        x, y, child = ctypes.c_int(), ctypes.c_int(), ctypes.c_ulong()
+        size = self._geometry(self._window)
+        screen = self._geometry(root)
+        x = ctypes.c_int()
+        y = ctypes.c_int()
+        child = ctypes.c_ulong()
         pointers = (ctypes.byref(part) for part in (x, y, child))
         if size is None or screen is None:
             return ""
         self._x11.XTranslateCoordinates(self._connection, self._window, root, 0, 0, *pointers)
         corner = x.value, y.value
         if self.place is not None:
-            return "" if ScreenArea(corner, size) == self.place else "moved off its display"
+            if ScreenArea(corner, size) == self.place:
+                return ""
+            return "moved off its display"
         inside = all(
             at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True)
         )
-        return "" if inside else "off the screen, in part or wholly"
+        if inside:
+            return ""
+        return "off the screen, in part or wholly"
 
     def _geometry(self, drawable: int) -> tuple[int, int] | None:
         root = ctypes.c_ulong()
-        x, y = ctypes.c_int(), ctypes.c_int()
+        x = ctypes.c_int()
+        y = ctypes.c_int()
         width, height, border, depth = (ctypes.c_uint() for _ in range(4))
         pointers = (ctypes.byref(part) for part in (root, x, y, width, height, border, depth))
         if not self._x11.XGetGeometry(self._connection, drawable, *pointers):
@@ -159,7 +170,8 @@ def _sleep_of(connection: int) -> Any:
         return bool
 
     def asleep() -> bool:
-        level, enabled = ctypes.c_ushort(), ctypes.c_ubyte()
+        level = ctypes.c_ushort()
+        enabled = ctypes.c_ubyte()
         known = library.DPMSInfo(connection, ctypes.byref(level), ctypes.byref(enabled))
         return bool(known and enabled.value and level.value)
 

@@ -33,11 +33,10 @@ def is_straight(ramp: bytes | FloatArray) -> bool:
     rounds to them. In a finer table half a code of 8 bits is a curve: a gamma of 1.005 has 6 % less
     light at the faintest code.
     """
-    parts = (
-        np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP
-        if isinstance(ramp, bytes)
-        else ramp
-    )
+    if isinstance(ramp, bytes):
+        parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP
+    else:
+        parts = ramp
     if not parts.size:
         return False
     off = np.abs(parts - np.linspace(0, 1, parts.shape[1]))
@@ -130,7 +129,8 @@ class DisplayWatch:
     ) -> None:
         self.ramp_changed = False
         self._shown: Counter[str] = Counter()
-        self._output, self._look_s = output, look_s
+        self._output = output
+        self._look_s = look_s
         self._randr: Randr | None = None
         self._events: PresentEvents | None = None
         self._lock = threading.Lock()
@@ -144,9 +144,9 @@ class DisplayWatch:
         self._thread.start()
 
     def _ramp(self) -> bytes:
-        return (
-            b"" if self._randr is None or self._output is None else self._randr.ramp(self._output)
-        )
+        if self._randr is None or self._output is None:
+            return b""
+        return self._randr.ramp(self._output)
 
     def _run(self) -> None:
         while not self._stop.wait(self._look_s):

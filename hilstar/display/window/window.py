@@ -74,7 +74,10 @@ class Display:
     def line(self) -> str:
         """The display for a person."""
         width, height = self.resolution_px
-        refresh = f"{self.refresh_hz} Hz" if self.refresh_hz else "refresh not known"
+        if self.refresh_hz:
+            refresh = f"{self.refresh_hz} Hz"
+        else:
+            refresh = "refresh not known"
         return (
             f"{self.index}: {self.name}, {width} x {height}, {refresh}, {self.size_mm[0]} x"
             f" {self.size_mm[1]} mm"
@@ -242,14 +245,20 @@ class Window(Closing):
         sync = sync_control(
             self._x_display, glfw.get_glx_window(self._window) if self._x_display else None
         )
-        refresh_hz = self.display.refresh_hz if self.display is not None else 0
+        if self.display is not None:
+            refresh_hz = self.display.refresh_hz
+        else:
+            refresh_hz = 0
         self._stamps = SwapStamps(
             sync, NS_PER_S / (refresh_hz or settings.refresh_hz or USUAL_REFRESH_HZ)
         )
         if monitor is not None:
             self._set_identity_ramp(monitor)
         if self._survival is not None:
-            name = None if self.display is None else self.display.name
+            if self.display is None:
+                name = None
+            else:
+                name = self.display.name
             self._watch = DisplayWatch(name, glfw.get_x11_window(self._window), self._survival)
 
     def _set_identity_ramp(self, monitor: Any) -> None:
@@ -278,7 +287,9 @@ class Window(Closing):
             return "without its display"
         if self._minimised:
             return "minimised"
-        return "" if self._visibility is None else self._visibility.hidden
+        if self._visibility is None:
+            return ""
+        return self._visibility.hidden
 
     def _on_end(self, why: str) -> None:
         if self.gone is None:
@@ -299,7 +310,8 @@ class Window(Closing):
             (m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None
         )
         if monitor is None and not self.lost:
-            self.lost, self._ramp = True, None
+            self.lost = True
+            self._ramp = None
             log.warning(
                 "the display %s is gone; frames go on, and the window returns to it when it is"
                 " back",
@@ -370,7 +382,7 @@ class Window(Closing):
     def by_wayland(self) -> bool:
         """True where the X server is XWayland: a Wayland compositor draws the display."""
         return has_extension(self._x_display, b"XWAYLAND") or any(
-            one.name.startswith("XWAYLAND") for one in _displays()
+            output.name.startswith("XWAYLAND") for output in _displays()
         )
 
     @property
@@ -378,7 +390,7 @@ class Window(Closing):
         """The names of the other displays of the same X screen, where this window fills one."""
         if self.display is None or self.gone is not None:
             return ()
-        return tuple(one.name for one in _displays() if one.name != self.display.name)
+        return tuple(output.name for output in _displays() if output.name != self.display.name)
 
     @property
     def mirrored(self) -> str | None:
@@ -400,8 +412,13 @@ class Window(Closing):
         none where it does not say.
         """
         display = self.display
-        monitor = None if self.gone is not None else glfw.get_window_monitor(self._window)
-        return () if not monitor or display is None else _modes_hz(display, monitor)
+        if self.gone is not None:
+            monitor = None
+        else:
+            monitor = glfw.get_window_monitor(self._window)
+        if not monitor or display is None:
+            return ()
+        return _modes_hz(display, monitor)
 
     @property
     def output(self) -> OutputState | None:
@@ -422,7 +439,9 @@ class Window(Closing):
         """Frames that the X server flipped, copied or skipped up to now; empty where it does not
         say.
         """
-        return {} if self._watch is None or self.gone is not None else self._watch.presented
+        if self._watch is None or self.gone is not None:
+            return {}
+        return self._watch.presented
 
     @property
     def timestamp_source(self) -> str:

@@ -42,8 +42,9 @@ def load_library(name: str, **functions: tuple[Any, ...]) -> Any:
     """
     library: Any = ctypes.CDLL(name)
     for function, (result, *arguments) in functions.items():
-        found = getattr(library, function)
-        found.restype, found.argtypes = result, arguments
+        symbol = getattr(library, function)
+        symbol.restype = result
+        symbol.argtypes = arguments
     return library
 
 
@@ -81,7 +82,9 @@ def server_of() -> str:
     if not display:
         return ""
     release = library.XVendorRelease(display)
-    major, minor, patch = release // 10_000_000, release // 100_000 % 100, release // 1000 % 100
+    major = release // 10_000_000
+    minor = release // 100_000 % 100
+    patch = release // 1000 % 100
     vendor = library.XServerVendor(display).decode(errors="replace")
     library.XCloseDisplay(display)
     return f"{vendor} {major}.{minor}.{patch}"
@@ -200,7 +203,9 @@ class SwapStamps:
         period_ns: float,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._sync, self._period_ns, self._now_ns = sync, period_ns, now_ns
+        self._sync = sync
+        self._period_ns = period_ns
+        self._now_ns = now_ns
         self._gaps = 0
         self.source = CLOCK if sync is None else SYNC_EXTENSION.decode()
 
@@ -214,7 +219,8 @@ class SwapStamps:
                 swap_ns is not None
                 and -self._period_ns <= self._now_ns() - swap_ns < MAX_UST_AGE_NS
             ):
-                self._gaps, self.source = 0, SYNC_EXTENSION.decode()
+                self._gaps = 0
+                self.source = SYNC_EXTENSION.decode()
                 return swap_ns
             self._gaps += 1
             if self._gaps == MAX_GAPS:
@@ -239,11 +245,9 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
             glXGetProcAddress=(POINTER, TEXT),
         )
         extensions = library.glXQueryExtensionsString(x_display, 0) or b""
-        return (
-            SyncControl(library, x_display, drawable)
-            if SYNC_EXTENSION in extensions.split()
-            else None
-        )
+        if SYNC_EXTENSION in extensions.split():
+            return SyncControl(library, x_display, drawable)
+        return None
     except (OSError, AttributeError):
         return None
 

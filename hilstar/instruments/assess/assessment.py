@@ -108,19 +108,25 @@ class Lock:
     @property
     def lost(self) -> tuple[Outage, ...]:
         """The outages in which the lock was lost."""
-        return tuple(each for each in self.outages if each.lost)
+        return tuple(outage for outage in self.outages if outage.lost)
 
     @property
     def acquisition_probability(self) -> float | None:
         """The share of appearances of a sky and losses of lock after which a right answer came."""
         if not self.acquisitions:
             return None
-        return sum(each.wait_s is not None for each in self.acquisitions) / len(self.acquisitions)
+        return sum(acquisition.wait_s is not None for acquisition in self.acquisitions) / len(
+            self.acquisitions
+        )
 
     @property
     def acquisition_s(self) -> float | None:
         """The median time until the first right answer."""
-        waits = [each.wait_s for each in self.acquisitions if each.wait_s is not None]
+        waits = [
+            acquisition.wait_s
+            for acquisition in self.acquisitions
+            if acquisition.wait_s is not None
+        ]
         return float(np.median(waits)) if waits else None
 
 
@@ -138,7 +144,8 @@ def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: Bool
             continue
         inner = np.arange(t_s[before] + cycle_s, t_s[after] - cycle_s / 2, cycle_s)
         if len(inner) and commanded.at(inner).known.mean() > 0.5:
-            length_s, rows = gap_s - cycle_s, after - before - 1
+            length_s = gap_s - cycle_s
+            rows = after - before - 1
             lost = length_s > LOST_CYCLES * cycle_s
             outages.append(
                 Outage(float(inner[0]), length_s, lost, rows, int(wrong[before + 1 : after].sum()))
@@ -213,14 +220,14 @@ def read_ledger(path: Path) -> RunLedger:
     """Read a ledger. Raises InputError for a file that is none, for damage, and for a run
     without attitudes or bench file.
     """
-    head, run = read_head(path), read_commanded(path)
+    head = read_head(path)
+    run = read_commanded(path)
     shown = run.commanded.shown
     if shown.sum() < 2:
-        why = (
-            "operators' keys or a hidden window changed all of them"
-            if run.changed
-            else "none of them has an attitude"
-        )
+        if run.changed:
+            why = "operators' keys or a hidden window changed all of them"
+        else:
+            why = "none of them has an attitude"
         raise InputError(
             f"{path}: {len(shown)} frames, and {why}; give the ledger of a run that was sent"
             " attitudes"
@@ -282,20 +289,17 @@ class Assessment:
     @property
     def missed_line(self) -> str:
         """The run's missed frames and what they do to the budget, in words."""
-        missed, held_s, hold_s = (
-            self.run.run.missed,
-            self.run.commanded.held_s,
-            self.run.commanded.hold_s,
-        )
+        missed = self.run.run.missed
+        held_s = self.run.commanded.held_s
+        hold_s = self.run.commanded.hold_s
         if not missed:
             return "none"
         share = 100 * missed / (missed + len(self.run.commanded.t_s))
         longest = int(np.argmax(hold_s)) if len(hold_s) else -1
-        where = (
-            f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"
-            if longest >= 0
-            else ""
-        )
+        if longest >= 0:
+            where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"
+        else:
+            where = ""
         touched = f"{len(self.found.held)} answers looked while a frame was held for them"
         return (
             f"{missed} ({share:.2g} % of refresh periods{where}); {touched}, and are in no figure"
@@ -326,11 +330,10 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
     """
     records = list(answer_records(ledger))
     if not any(record.valid and record.q is not None for record in records):
-        has = (
-            f"{len(records)} answers, none of them with an attitude"
-            if records
-            else "no answers of a tracker"
-        )
+        if records:
+            has = f"{len(records)} answers, none of them with an attitude"
+        else:
+            has = "no answers of a tracker"
         raise InputError(
             f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with"
             " [answers]"
@@ -342,17 +345,22 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
         t_ns, np.array([record.host_ns for record in records], dtype=np.int64)
     )
     if clock_set or not stamped:
-        t_ns, stamp = on_run_ns, "middle"
-    overtaken = (
-        int((t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]).sum()) if stamped and not clock_set else 0
-    )
+        t_ns = on_run_ns
+        stamp = "middle"
+    if stamped and not clock_set:
+        overtaken = int((t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]).sum())
+    else:
+        overtaken = 0
     # By their times, for a datagram may be overtaken; of one time the first that came.
     rising_ns, order = np.unique(t_ns, return_index=True)
-    kept = [records[k] for k in order.tolist()]
-    valid = np.array([record.valid and record.q is not None for record in kept], dtype=np.bool_)
-    q = np.array([NOT_SHOWN if record.q is None else record.q for record in kept], dtype=np.float64)
+    ordered = [records[k] for k in order.tolist()]
+    valid = np.array([record.valid and record.q is not None for record in ordered], dtype=np.bool_)
+    q = np.array(
+        [NOT_SHOWN if record.q is None else record.q for record in ordered], dtype=np.float64
+    )
     telemetry = Telemetry(ledger, rising_ns, q, valid, order + 1, of_lines=False)
-    ahead_ns, centroids = int(np.median(t_ns - on_run_ns)), [record.centroids for record in kept]
+    ahead_ns = int(np.median(t_ns - on_run_ns))
+    centroids = [record.centroids for record in ordered]
     return LedgerAnswers(telemetry, stamp, ahead_ns, centroids, overtaken, clock_set)
 
 
@@ -424,7 +432,7 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         )
     coarse = matched(run, answers, tau_s[valid], answers.q[valid])
     try:
-        found = assess_run(
+        error_budget = assess_run(
             run.commanded,
             tau_s[valid],
             answers.q[valid],
@@ -434,17 +442,26 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         )
     except InputError as refusal:
         raise InputError(f"{telemetry}: {refusal}") from refusal
-    t_s = start_s + (tau_s - found.clock.offset_s - start_s) / (1 + found.clock.drift)
+    t_s = start_s + (tau_s - error_budget.clock.offset_s - start_s) / (1 + error_budget.clock.drift)
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
-    right[valid[found.row]], right[valid[found.held]], wrong[valid[found.wrong]] = True, True, True
-    off_deg = np.degrees(np.linalg.norm(found.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD)
-    notes = [*_notes(run, found, 0.0 if overlap else base_s), *([CLOCK_SET] if clock_set else [])]
+    (
+        right[valid[error_budget.row]],
+        right[valid[error_budget.held]],
+        wrong[valid[error_budget.wrong]],
+    ) = True, True, True
+    off_deg = np.degrees(
+        np.linalg.norm(error_budget.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD
+    )
+    notes = [
+        *_notes(run, error_budget, 0.0 if overlap else base_s),
+        *([CLOCK_SET] if clock_set else []),
+    ]
     # The error by rate and by magnitude, and the display's own.
-    parts = found.components
+    parts = error_budget.components
     error = parts.fov.fitted + parts.pixel.fitted + parts.left
     freedom = parts.fov.freedom + parts.pixel.freedom + 1
     by_rate = slices_of(
-        np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom
+        np.degrees(np.linalg.norm(error_budget.rate_rad_s, axis=1)), parts.left, error, freedom
     )
     by_magnitude: tuple[Slice, ...] = ()
     display = limit = glass = certificate = None
@@ -452,18 +469,22 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         file = run.bench_file()
         certificate = bench_certificate(file)
         by_magnitude = slices_of(
-            field_magnitudes(file, found.commanded_q), parts.left, error, freedom
+            field_magnitudes(file, error_budget.commanded_q), parts.left, error, freedom
         )
-        limit = noise_limit(file, found.commanded_q)
+        limit = noise_limit(file, error_budget.commanded_q)
         glass, told_by = _glass_of(
-            file, found, [centroids[row] for row in valid[found.row]] if any(centroids) else ()
+            file,
+            error_budget,
+            [centroids[row] for row in valid[error_budget.row]] if any(centroids) else (),
         )
         notes += told_by
         if settings.display_attitudes:
             some = np.unique(
-                np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int)
+                np.linspace(0, len(error_budget.row) - 1, settings.display_attitudes).astype(int)
             )
-            display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
+            display = display_cost(
+                display_errors(file, error_budget.commanded_q[some]), parts.left[some]
+            )
             if display is None:
                 notes.append(
                     "the display shows too few stars at once for an attitude: its own error was not"
@@ -474,13 +495,13 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
             "neither the field's magnitude nor the display's own error could be found from the"
             f" ledger: {refusal}"
         )
-    noise_arcsec, said = _without_display(found, display)
+    noise_arcsec, display_note = _without_display(error_budget, display)
     return Assessment(
         run=run,
         telemetry=answers,
-        found=found,
+        found=error_budget,
         noise_arcsec=noise_arcsec,
-        offset_s=found.clock.offset_s + base_s,
+        offset_s=error_budget.clock.offset_s + base_s,
         lock=lock_of(run.commanded, t_s, right, wrong),
         wrong=tuple(
             WrongAnswer(
@@ -489,7 +510,7 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
                 float(t_s[at]),
                 float(off_deg[k]),
             )
-            for k, at in zip(found.wrong, valid[found.wrong], strict=True)
+            for k, at in zip(error_budget.wrong, valid[error_budget.wrong], strict=True)
         ),
         display=display,
         limit_arcsec=limit,
@@ -497,7 +518,7 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         by_rate=by_rate,
         by_magnitude=by_magnitude,
         t_s=t_s,
-        notes=(*notes, *said),
+        notes=(*notes, *display_note),
         certificate=certificate,
         out_of_order=out_of_order,
     )
@@ -513,11 +534,10 @@ def _glass_of(
     cost = seen_cost(file, turned, centroids) or glass_cost(file, found.commanded_q)
     if cost is None or cost.source != FILE:
         return cost, []
-    has = (
-        "name too few stars"
-        if centroids
-        else "hold only attitudes, which cannot tell colour from distortion"
-    )
+    if centroids:
+        has = "name too few stars"
+    else:
+        has = "hold only attitudes, which cannot tell colour from distortion"
     return cost, [f"the answers {has}: what the glass costs is told by the PSF file"]
 
 
@@ -529,7 +549,10 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
     """
     commanded = run.commanded
     coarse = coarse_offset(commanded, tau_s, q)
-    agreed = coarse if coarse is not None and coarse.spread_rad <= AGREE_RAD else None
+    if coarse is not None and coarse.spread_rad <= AGREE_RAD:
+        agreed = coarse
+    else:
+        agreed = None
     if agreed is not None and agreed.turn_rad <= MAX_TURN_RAD:
         return agreed
     turned = ""
@@ -542,7 +565,8 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
             f" degrees about {axis} (cam) from the commanded ones"
         )
         # The nearest rotation that only names the axes otherwise, of which there are 24.
-        matrix, nearest = to_matrix(agreed.rotation), np.zeros((3, 3))
+        matrix = to_matrix(agreed.rotation)
+        nearest = np.zeros((3, 3))
         column = np.argmax(np.abs(matrix), axis=1)
         nearest[range(3), column] = np.sign(matrix[range(3), column])
         off = np.arccos(np.clip((np.trace(matrix @ nearest.T) - 1) / 2, -1, 1))
@@ -592,7 +616,9 @@ def _refuse(run: RunLedger, telemetry: Telemetry, t_s: FloatArray, q: FloatArray
 
 def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
     """What a reader of the budget has to know beside its figures."""
-    notes, clock, parts = [*found.notes], found.clock, found.components
+    notes = [*found.notes]
+    clock = found.clock
+    parts = found.components
     if base_s:
         notes.append(
             f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its"
@@ -655,11 +681,10 @@ def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Ax
         " about it"
     )
     says = f"the answers show {display.seen:.2f} +- {display.sigma_seen:.2f} of it"
-    done = (
-        f"{100 * share:.0f} % of its variance are subtracted from the noise"
-        if share
-        else "nothing is subtracted"
-    )
+    if share:
+        done = f"{100 * share:.0f} % of its variance are subtracted from the noise"
+    else:
+        done = "nothing is subtracted"
     return without, [
         f"the display's own error is not small beside the noise: {size}; {says}, and {done}"
     ]

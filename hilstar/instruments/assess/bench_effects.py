@@ -69,33 +69,34 @@ def slices_of(
     `freedom` is the number of degrees of freedom that the fits took.
     """
     known = np.isfinite(value)
-    value, left, error = value[known], left[known], error[known]
+    value = value[known]
+    left = left[known]
+    error = error[known]
     count = len(value)
     if count < MIN_IN_BIN:
         return ()
     growth = len(known) / max(len(known) - freedom, 1.0)
     spread = float(np.ptp(value))
-    bins = (
-        min(BINS, count // MIN_IN_BIN)
-        if spread > 1e-3 * max(abs(float(np.median(value))), 1e-6)
-        else 1
-    )
+    if spread > 1e-3 * max(abs(float(np.median(value))), 1e-6):
+        bins = min(BINS, count // MIN_IN_BIN)
+    else:
+        bins = 1
     edges = np.unique(np.quantile(value, np.linspace(0, 1, bins + 1)))
     if len(edges) < 2:
         edges = np.array([value.min(), value.max()])
     place = np.clip(np.searchsorted(edges, value, side="right") - 1, 0, len(edges) - 2)
-    found = []
+    slices = []
     for k in range(len(edges) - 1):
         rows = place == k
         if rows.sum() >= MIN_IN_BIN:
-            noise, whole = growth * (left[rows] ** 2).mean(axis=0), (error[rows] ** 2).mean(axis=0)
-            axes = [
-                float(np.sqrt(part))
-                for each in (noise, whole)
-                for part in ((each[0] + each[1]) / 2, each[2])
-            ]
-            found.append(Slice(float(edges[k]), float(edges[k + 1]), int(rows.sum()), *axes))
-    return tuple(found)
+            noise = growth * (left[rows] ** 2).mean(axis=0)
+            whole = (error[rows] ** 2).mean(axis=0)
+            axes = []
+            for bounds in (noise, whole):
+                for part in ((bounds[0] + bounds[1]) / 2, bounds[2]):
+                    axes.append(float(np.sqrt(part)))
+            slices.append(Slice(float(edges[k]), float(edges[k + 1]), int(rows.sum()), *axes))
+    return tuple(slices)
 
 
 def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -113,13 +114,13 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     reach = 2 * np.sin(min(camera.field_radius_rad(0.0), np.pi / 2) / 2)
     light = np.zeros(len(some))
     near: list[IntArray] = [
-        np.array(each, dtype=np.intp)
-        for each in cKDTree(stars.vectors).query_ball_point(axes[:, 2], reach)
+        np.array(star_rows, dtype=np.intp)
+        for star_rows in cKDTree(stars.vectors).query_ball_point(axes[:, 2], reach)
     ]
-    for k, each in enumerate(near):
-        x_px, y_px = camera.project(stars.vectors[each] @ axes[k].T)
+    for k, star_rows in enumerate(near):
+        x_px, y_px = camera.project(stars.vectors[star_rows] @ axes[k].T)
         inside = (x_px > -0.5) & (x_px < width - 0.5) & (y_px > -0.5) & (y_px < height - 0.5)
-        light[k] = float(flux_ratio(stars.v_mag[each][inside]).sum())
+        light[k] = float(flux_ratio(stars.v_mag[star_rows][inside]).sum())
     field = np.where(light > 0, magnitude(np.maximum(light, 1e-30)), np.nan)
     nearest = np.abs(np.searchsorted(some, np.arange(len(q_icrs_to_cam))).clip(0, len(some) - 1))
     return np.asarray(field[nearest])
@@ -133,7 +134,7 @@ def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
     """
     some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, LIMIT_FIELDS).astype(int))
     median = np.median(attitude_limits_arcsec(file, q_icrs_to_cam[some]), axis=0).tolist()
-    return Axes(*(each if math.isfinite(each) else None for each in median))
+    return Axes(*(axis_arcsec if math.isfinite(axis_arcsec) else None for axis_arcsec in median))
 
 
 def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -153,10 +154,11 @@ def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
             )
             both = (sky.index >= 0) & (shown.index >= 0)
             if both.sum() >= MIN_STARS:
-                i, j = sky.index[both], shown.index[both]
+                i = sky.index[both]
+                j = shown.index[both]
                 true = normalise(twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i]))
-                seen = normalise(twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j]))
-                errors[number] = ARCSEC_PER_RAD * turn_between(true, seen, sky.found.flux[i])
+                rays = normalise(twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j]))
+                errors[number] = ARCSEC_PER_RAD * turn_between(true, rays, sky.found.flux[i])
     return errors
 
 
@@ -169,10 +171,10 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = z, -y, x
     cross -= np.swapaxes(cross, 1, 2)
     root = np.sqrt(weight)[:, None]
-    found, *_ = np.linalg.lstsq(
+    turn, *_ = np.linalg.lstsq(
         (cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None
     )
-    return np.asarray(found)
+    return np.asarray(turn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,15 +208,15 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
     """The glass's part of the field-of-view error along attitudes (n, 4); None without a glass,
     or with too few stars.
     """
-    tracker, fields = file.config.tracker, []
-    psf, camera = tracker_psf(tracker, file.folder), tracker_camera(tracker, file.folder)
+    tracker = file.config.tracker
+    fields = []
+    psf = tracker_psf(tracker, file.folder)
+    camera = tracker_camera(tracker, file.folder)
     glass = star_glass(file, psf)
     if glass is None:
         return None
-    stars, kind = (
-        bench_stars(file.config, file.folder),
-        file.config.verify.judge or "window",
-    )
+    stars = bench_stars(file.config, file.folder)
+    kind = file.config.verify.judge or "window"
     reach = math.ceil(4 * max(1.0, *psf.width_px))
     some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, GLASS_FIELDS).astype(int))
     for q in normalise(q_icrs_to_cam[some]):
@@ -222,10 +224,10 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
         pixels = np.rint(rows["y_px"]).astype(np.intp), np.rint(rows["x_px"]).astype(np.intp)
         true = np.stack([rows["x_px"] - pixels[1], rows["y_px"] - pixels[0]], axis=1)
         stamps = told_psf(psf, pixels, 2 * reach + 1, glass.shares_of(stars, rows["hip"]))(*true.T)
-        found = np.stack(star_places(stamps, kind, psf.width_px), axis=1)
+        places_px = np.stack(star_places(stamps, kind, psf.width_px), axis=1)
         lit = stamps.sum(axis=(1, 2)) > 0  # a corner may be dark
         if lit.sum() >= MIN_STARS:
-            fields.append((rows[lit], (found - true)[lit]))
+            fields.append((rows[lit], (places_px - true)[lit]))
     return _cost(FILE, kind, camera, fields)
 
 
@@ -237,13 +239,13 @@ def seen_cost(
 
     The tracker's noise is in it. None for too few stars.
     """
-    camera, stars, fields = (
-        tracker_camera(file.config.tracker, file.folder),
-        bench_stars(file.config, file.folder),
-        [],
-    )
+    camera = tracker_camera(file.config.tracker, file.folder)
+    stars = bench_stars(file.config, file.folder)
+    fields = []
     named = [
-        k for k, own in enumerate(centroids) if sum(bool(star[3]) for star in own) >= MIN_STARS
+        k
+        for k, reported_stars in enumerate(centroids)
+        if sum(bool(star[3]) for star in reported_stars) >= MIN_STARS
     ]
     for k in (
         named[j]
@@ -253,8 +255,8 @@ def seen_cost(
         at = {star[3]: star[:2] for star in centroids[k] if star[3]}
         rows = field_stars(stars, camera, q_icrs_to_cam[k])
         rows = rows[np.isin(rows["hip"], list(at))]
-        seen = np.array([at[hip] for hip in rows["hip"].tolist()]).reshape(-1, 2)
-        fields.append((rows, seen - np.stack([rows["x_px"], rows["y_px"]], axis=1)))
+        reported_px = np.array([at[hip] for hip in rows["hip"].tolist()]).reshape(-1, 2)
+        fields.append((rows, reported_px - np.stack([rows["x_px"], rows["y_px"]], axis=1)))
     if not fields:
         return None
     far_px = np.concatenate([np.hypot(*off.T) for _, off in fields])
@@ -290,13 +292,13 @@ def _cost(
         "without_colour": split.total - split.colour,
         "without_both": split.psf,
     }
-    ends = np.cumsum([len(each) for each, _ in fields])[:-1]
+    ends = np.cumsum([len(field_rows) for field_rows, _ in fields])[:-1]
     fov = {}
     for name, off in parts.items():
         turns = np.array(
             [
-                _field_turn(camera, each, px)
-                for (each, _), px in zip(fields, np.split(off, ends), strict=True)
+                _field_turn(camera, field_rows, px)
+                for (field_rows, _), px in zip(fields, np.split(off, ends), strict=True)
             ]
         )
         fov[name] = axes_of_variance(turns.var(axis=0))
@@ -306,11 +308,11 @@ def _cost(
 
 def _field_turn(camera: Camera, rows: npt.NDArray[np.void], off_px: FloatArray) -> FloatArray:
     """The attitude's error (3,), arcsec, by stars whose places are off by `off_px` (n, 2)."""
-    true, seen = (
+    true, shown = (
         normalise(camera.rays(rows["x_px"] + dx, rows["y_px"] + dy))
         for dx, dy in ((0.0, 0.0), off_px.T)
     )
-    return ARCSEC_PER_RAD * turn_between(true, seen, rows["electrons_per_s"])
+    return ARCSEC_PER_RAD * turn_between(true, shown, rows["electrons_per_s"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +335,9 @@ class DisplayCost:
         """The share of the display's variance that is subtracted from the noise; 0 unless `seen`
         exceeds three sigma.
         """
-        return min(self.seen, 1.0) ** 2 if self.seen > SURE * self.sigma_seen else 0.0
+        if self.seen > SURE * self.sigma_seen:
+            return min(self.seen, 1.0) ** 2
+        return 0.0
 
 
 def display_cost(error_arcsec: FloatArray, left_arcsec: FloatArray) -> DisplayCost | None:
@@ -344,15 +348,15 @@ def display_cost(error_arcsec: FloatArray, left_arcsec: FloatArray) -> DisplayCo
     if known.sum() < MIN_STARS:
         return None
     error = error_arcsec[known] - error_arcsec[known].mean(axis=0)
-    left = left_arcsec[known]
-    variance = np.maximum((left**2).mean(axis=0), 1e-12)
+    residual = left_arcsec[known]
+    variance = np.maximum((residual**2).mean(axis=0), 1e-12)
     information = float((error**2 / variance).sum())
-    seen = float((error * left / variance).sum()) / max(information, 1e-30)
+    share = float((error * residual / variance).sum()) / max(information, 1e-30)
     power = (error**2).sum(axis=0) / max(len(error) - 1, 1)
     return DisplayCost(
         cross_arcsec=float(np.sqrt(power[:2].mean())),
         roll_arcsec=float(np.sqrt(power[2])),
         attitudes=int(known.sum()),
-        seen=seen,
+        seen=share,
         sigma_seen=1 / float(np.sqrt(max(information, 1e-30))),
     )

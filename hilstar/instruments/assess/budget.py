@@ -103,7 +103,8 @@ def assess_run(
     them are wild.
     """
     clock = ClockSolver(commanded, tau_s, reported, scale).fit(coarse)
-    known, held = clock.moments.known, clock.moments.known & (clock.moments.held_s > 0)
+    known = clock.moments.known
+    held = clock.moments.known & (clock.moments.held_s > 0)
     free = known & ~held
     if known.sum() < MIN_ROWS:
         raise InputError(
@@ -132,11 +133,13 @@ def assess_run(
     total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
     right, parts = _right_answers(total, clock.moments.q, clock.used, scale)
     intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
-    found = _decomposed(parts, intervals, free, right, clock.moments.q, clock.moments.rate_rad_s)
+    decomposed = _decomposed(
+        parts, intervals, free, right, clock.moments.q, clock.moments.rate_rad_s
+    )
     astray = held & _beyond_turn(clock, parts)
-    wrong = np.sort(np.append(found.wrong, np.flatnonzero(astray)))
+    wrong = np.sort(np.append(decomposed.wrong, np.flatnonzero(astray)))
     return DecomposedRun(
-        **{**vars(found), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray)
+        **{**vars(decomposed), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray)
     )
 
 
@@ -174,7 +177,10 @@ def assess_cases(
         raise InputError(
             f"half or more of the answers are wild: {int(used.sum())} of {int(known.sum())} agree"
         )
-    rate = np.zeros_like(error) if rate_rad_s is None else rate_rad_s
+    if rate_rad_s is None:
+        rate = np.zeros_like(error)
+    else:
+        rate = rate_rad_s
     right, parts = _right_answers(error, commanded, used, scale)
     return _decomposed(parts, intervals_of(parts, rng), known, right, commanded, rate)
 
@@ -215,7 +221,7 @@ def _decomposed(
         wrong=np.flatnonzero(known & ~right),
         commanded_q=q[row],
         rate_rad_s=rate[row],
-        notes=tuple(each.reason for each in (parts.fov, parts.pixel) if each.reason),
+        notes=tuple(component.reason for component in (parts.fov, parts.pixel) if component.reason),
     )
 
 
@@ -237,7 +243,9 @@ def axes_of_variance(variance: FloatArray) -> Axes:
 
 
 def _told(part: Component) -> Axes:
-    return Axes(None, None) if part.reason else axes_of_variance(part.variance)
+    if part.reason:
+        return Axes(None, None)
+    return axes_of_variance(part.variance)
 
 
 def intervals_of(
@@ -249,8 +257,10 @@ def intervals_of(
     `sigma_bias_arcsec` (3,) is the smallest uncertainty of the bias, where the clock was found
     together with it.
     """
-    left, fov, pixel = parts.left, parts.fov, parts.pixel
-    n = len(left)
+    residual = parts.left
+    fov = parts.fov
+    pixel = parts.pixel
+    n = len(residual)
     blocks = max(2, min(BLOCKS, n // MIN_IN_BLOCK))
     block = np.arange(n) * blocks // n
     count = np.bincount(block).astype(float)
@@ -260,16 +270,20 @@ def intervals_of(
 
     drawn = rng.integers(0, blocks, (DRAWS, blocks))
     rows = count[drawn].sum(axis=1)[:, None]
-    total = sums(left + fov.fitted + pixel.fitted)[drawn].sum(axis=1) / rows
+    total = sums(residual + fov.fitted + pixel.fitted)[drawn].sum(axis=1) / rows
     spread = np.std(total, axis=0)
     if sigma_bias_arcsec is not None:
         spread = np.maximum(spread, sigma_bias_arcsec)
     freedom = n - 1 - fov.freedom - pixel.freedom
-    noise = sums(left**2)[drawn].sum(axis=1) / rows * (n / max(freedom, 1.0))
-    repeating = [
-        np.maximum(sums(each.fitted**2)[drawn].sum(axis=1) / rows - each.freedom / n * noise, 0.0)
-        for each in (fov, pixel)
-    ]
+    noise = sums(residual**2)[drawn].sum(axis=1) / rows * (n / max(freedom, 1.0))
+    repeating = []
+    for component in (fov, pixel):
+        repeating.append(
+            np.maximum(
+                sums(component.fitted**2)[drawn].sum(axis=1) / rows - component.freedom / n * noise,
+                0.0,
+            )
+        )
     return Intervals(
         bias=np.stack([parts.mean - HALF_OF_95 * spread, parts.mean + HALF_OF_95 * spread]),
         fov=_covered(repeating[0]),

@@ -96,7 +96,8 @@ def coarse_offset(
     gives an overlap.
     """
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED).astype(int))
-    t, q = t_s[few], reported[few]
+    t = t_s[few]
+    q = reported[few]
     # Starts or ends together, and where speeds or attitudes agree.
     tried = [_spread_at(commanded, t, q, float(commanded.t_s[end] - t_s[end])) for end in (0, -1)]
     for peaks, reach_s in (
@@ -113,7 +114,9 @@ def coarse_offset(
     best = min((each for each in good if each.compared >= many), key=lambda each: each.turn_rad)
     as_they_are = _spread_at(commanded, t, q, 0.0)
     if as_they_are is not None and as_they_are.compared >= many and as_they_are.spread_rad <= limit:
-        return as_they_are if as_they_are.turn_rad <= best.turn_rad + TURN_RAD else best
+        if as_they_are.turn_rad <= best.turn_rad + TURN_RAD:
+            return as_they_are
+        return best
     return best
 
 
@@ -132,15 +135,18 @@ def _nearby(
         return first
 
     def spread(offset: float) -> float:
-        found = _spread_at(commanded, t_s, reported, offset)
-        return np.pi if found is None else found.spread_rad
+        spread_there = _spread_at(commanded, t_s, reported, offset)
+        return np.pi if spread_there is None else spread_there.spread_rad
 
-    low, high = offset_s - reach_s, offset_s + reach_s
+    low = offset_s - reach_s
+    high = offset_s + reach_s
     better = optimize.minimize_scalar(
         spread, bounds=(low, high), method="bounded", options={"maxiter": 12}
     )
     found = _spread_at(commanded, t_s, reported, float(better.x))
-    return found if found is not None and found.spread_rad < first.spread_rad else first
+    if found is not None and found.spread_rad < first.spread_rad:
+        return found
+    return first
 
 
 def _spread_at(
@@ -174,11 +180,13 @@ def _by_attitude(
     scan.
     """
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED // 4).astype(int))
-    t, q = t_s[few], reported[few]
+    t = t_s[few]
+    q = reported[few]
     reach = np.linspace(commanded.t_s[0] - t_s[-1], commanded.t_s[-1] - t_s[0], SCANNED)
     angle = np.full(len(reach), np.inf)
     shown = commanded.shown
-    frame_s, frame_q = commanded.t_s[shown], commanded.q[shown]
+    frame_s = commanded.t_s[shown]
+    frame_q = commanded.q[shown]
     for k, offset in enumerate(reach):  # the frame after each moment is near enough for a scan
         frame = np.searchsorted(frame_s, t + offset)
         inside = (frame > 0) & (frame < len(frame_s))
@@ -192,7 +200,10 @@ def _by_speed(
     commanded: Commanded, t_s: FloatArray, reported: FloatArray
 ) -> tuple[FloatArray, float]:
     """The offsets at which angular speeds correlate best, and the step of the grid."""
-    cycle_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    if len(t_s) > 1:
+        cycle_s = float(np.median(np.diff(t_s)))
+    else:
+        cycle_s = 0.0
     step_s = max(STEP_S, 2 * cycle_s, 2 * commanded.interval_s)
     spans = commanded.t_s[-1] - commanded.t_s[0], t_s[-1] - t_s[0]
     step_s = max(step_s, max(spans) / MAX_BINS)
@@ -214,16 +225,19 @@ def _speeds(
     bins = int(span_s / step_s) + 1
     after = np.searchsorted(t_s, t_s + step_s)
     inside = after < len(t_s)
-    before, after = np.flatnonzero(inside), after[inside]
+    before = np.flatnonzero(inside)
+    after = after[inside]
     gap_s = t_s[after] - t_s[before]
     cosine = np.minimum(np.abs((q[before] * q[after]).sum(axis=1)), 1)
     chord = np.sqrt(2 - 2 * cosine)
     speed = 4 * np.arcsin(np.minimum(chord / 2, 1)) / gap_s
     place = np.clip((((t_s[before] + t_s[after]) / 2 - start_s) / step_s).astype(int), 0, bins - 1)
     good = gap_s < 3 * step_s
-    place, speed = place[good], speed[good]
+    place = place[good]
+    speed = speed[good]
     order = np.lexsort((speed, place))
-    place, speed = place[order], speed[order]
+    place = place[order]
+    speed = speed[order]
     first = np.searchsorted(place, np.arange(bins))
     count = np.searchsorted(place, np.arange(bins), side="right") - first
     median = np.full(bins, np.nan)
@@ -237,18 +251,22 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     bin; and the lags.
     """
     size = fft.next_fast_len(len(a) + len(b), real=True)
-    weight_a, weight_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
+    weight_a = np.isfinite(a).astype(float)
+    weight_b = np.isfinite(b).astype(float)
     # A wild pair of answers turns at any speed: speeds above twice the run's largest are clipped.
     limit = 2 * float(np.nanmax(a, initial=0.0)) + 1e-12
-    a, b = np.nan_to_num(a), np.minimum(np.nan_to_num(b), limit)
+    a = np.nan_to_num(a)
+    b = np.minimum(np.nan_to_num(b), limit)
     mean = float(a.sum() / max(weight_a.sum(), 1))
-    a, b = (a - mean) * weight_a, (b - mean) * weight_b
+    a = (a - mean) * weight_a
+    b = (b - mean) * weight_b
 
     def over_lags(x: FloatArray, y: FloatArray) -> FloatArray:
         return np.asarray(fft.irfft(fft.rfft(x, size) * np.conj(fft.rfft(y, size)), size))
 
     count = np.maximum(np.rint(over_lags(weight_a, weight_b)), 0)
-    sum_a, sum_b = over_lags(a, weight_b), over_lags(weight_a, b)
+    sum_a = over_lags(a, weight_b)
+    sum_b = over_lags(weight_a, b)
     with np.errstate(divide="ignore", invalid="ignore"):
         covariance = over_lags(a, b) - sum_a * sum_b / count
         spread_a = over_lags(a * a, weight_b) - sum_a**2 / count
@@ -266,7 +284,8 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
     """The places of a score's highest peaks, best first."""
     order = np.argsort(at)
-    score, at = score[order], at[order]
+    score = score[order]
+    at = at[order]
     inner = np.r_[-np.inf, score, -np.inf]
     peak = np.flatnonzero((score >= inner[:-2]) & (score >= inner[2:]) & np.isfinite(score))
     return at[peak[np.argsort(-score[peak])][:TRIED]]
@@ -315,13 +334,18 @@ class ClockSolver:
     def __init__(
         self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale
     ) -> None:
-        self.commanded, self.tau_s, self.reported, self.scale = commanded, tau_s, reported, scale
+        self.commanded = commanded
+        self.tau_s = tau_s
+        self.reported = reported
+        self.scale = scale
         self.start_s = float(commanded.t_s[0])
         self.span_s = max(float(commanded.t_s[-1]) - self.start_s, 1e-9)
 
     def fit(self, coarse: CoarseClock) -> ClockFit:
         """The fit, begun at a coarse clock."""
-        self.rotation, self.delay_s, self.stretch_s = coarse.rotation, -coarse.offset_s, 0.0
+        self.rotation = coarse.rotation
+        self.delay_s = -coarse.offset_s
+        self.stretch_s = 0.0
         self._align()
         used = self._robust(-coarse.offset_s)
         covariance = np.linalg.inv(
@@ -395,7 +419,8 @@ class ClockSolver:
         wild.
         """
         for _ in range(ROUNDS):
-            rows, residual = self.free, self.residual[self.free]
+            rows = self.free
+            residual = self.residual[self.free]
             if rows.sum() < MIN_USED:
                 break
             sigma, weight = weights_of(residual)
@@ -405,10 +430,8 @@ class ClockSolver:
             normal, right = self._prior(begun_s)
             for axis in range(3):
                 scaled = design[axis] * (weight / sigma[axis] ** 2)[:, None]
-                normal, right = (
-                    normal + scaled.T @ design[axis],
-                    right + scaled.T @ residual[:, axis],
-                )
+                normal = normal + scaled.T @ design[axis]
+                right = right + scaled.T @ residual[:, axis]
             step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
             self._align(step)
             if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
@@ -420,16 +443,17 @@ class ClockSolver:
 
     def _refine(self, used: BoolArray, begun_s: float) -> FloatArray:
         """One generalised least squares step; its covariance (5, 5)."""
-        design, left = self._design(used), self.residual[used]
+        design = self._design(used)
+        residual = self.residual[used]
         place = places_of(to_matrix(self.moments.q[used]), self.scale.focal_px, self.scale.roll_px)
         normal, right = self._prior(begun_s)
-        smooth = most_likely(place, left)
-        pulls = np.zeros((len(left), 5))
+        smooth = most_likely(place, residual)
+        pulls = np.zeros((len(residual), 5))
         for axis in range(3):
-            whitened = smooth.whiten(np.column_stack([design[axis], left[:, axis]]), axis)
+            whitened = smooth.whiten(np.column_stack([design[axis], residual[:, axis]]), axis)
             normal = normal + design[axis].T @ whitened[:, :5]
             right = right + design[axis].T @ whitened[:, 5]
-            pulls += whitened[:, :5] * left[:, axis : axis + 1]
+            pulls += whitened[:, :5] * residual[:, axis : axis + 1]
         covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         self._align(covariance @ right)
         return honest(covariance, pulls, place)
@@ -491,18 +515,19 @@ def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
     """The spacing, and each axis's variances, under which residuals (n, 3) about their mean are
     most likely.
     """
-    left = residual - residual.mean(axis=0)
-    n = len(left)
-    power = np.maximum((left**2).mean(axis=0), FLOOR_ARCSEC**2)
+    centred = residual - residual.mean(axis=0)
+    n = len(centred)
+    power = np.maximum((centred**2).mean(axis=0), FLOOR_ARCSEC**2)
     best = Smooth(None, np.zeros((0, 0)), np.zeros(0), np.zeros(3), power)
     likely = -0.5 * n * float(np.log(power).sum())
     spacing = MIN_SPACING_PX
     while spacing <= MAX_SPACING_PX:
         centre = centres_of(place, spacing)
         if 1 < len(centre) <= min(MAX_BUMPS, n // 8):
-            found, likelihood = _variances(bumps_at(place, centre, spacing), left)
+            variances, likelihood = _variances(bumps_at(place, centre, spacing), centred)
             if likelihood > likely:
-                best, likely = found, likelihood
+                best = variances
+                likely = likelihood
         if len(centre) <= 2:
             break
         spacing *= 2
@@ -514,15 +539,18 @@ def _variances(bumps: sparse.csr_matrix, left: FloatArray) -> tuple[Smooth, floa
     square, turn = linalg.eigh(np.asarray((bumps.T @ bumps).todense()), check_finite=False)
     square = np.maximum(square, 0.0)
     projected = (turn.T @ (bumps.T @ left)) ** 2  # (p, 3)
-    n, total = len(left), (left**2).sum(axis=0)
-    kappa, variance, likelihood = np.zeros(3), np.zeros(3), 0.0
+    n = len(left)
+    total = (left**2).sum(axis=0)
+    kappa = np.zeros(3)
+    variance = np.zeros(3)
+    likelihood = 0.0
     grown = 1 + KAPPAS[:, None] * square  # (kappas, p)
     logs = np.log(grown).sum(axis=1)
     for axis in range(3):
         rest = total[axis] - ((KAPPAS[:, None] / grown) * projected[:, axis]).sum(axis=1)
         rest = np.maximum(rest / n, FLOOR_ARCSEC**2)
-        each = -0.5 * (n * np.log(rest) + logs)
-        k = int(np.argmax(each))
+        likelihoods = -0.5 * (n * np.log(rest) + logs)
+        k = int(np.argmax(likelihoods))
         kappa[axis], variance[axis] = KAPPAS[k], rest[k]
-        likelihood += float(each[k])
+        likelihood += float(likelihoods[k])
     return Smooth(bumps, turn, square, kappa, variance), likelihood

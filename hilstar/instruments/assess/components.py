@@ -116,25 +116,30 @@ def components_of(
     about = residual_arcsec - mean
     place = places_of(to_matrix(q_icrs_to_cam), scale.focal_px, scale.roll_px)
     extent = float(np.linalg.norm(np.ptp(place, axis=0)))
-    bumps, words = _bumps(place, extent, scale)
-    pixel, waves = Component(NOTHING, np.zeros_like(about), 0.0), None
-    fov = pixel if bumps is not None else replace(pixel, reason=words)
+    bumps, bumps_note = _bumps(place, extent, scale)
+    pixel = Component(NOTHING, np.zeros_like(about), 0.0)
+    waves = None
+    if bumps is not None:
+        fov = pixel
+    else:
+        fov = replace(pixel, reason=bumps_note)
     for turn in range(TURNS):
         if bumps is not None:
-            fov = replace(_component(bumps, about - pixel.fitted, pixel.freedom), detail=words)
+            fov = replace(_component(bumps, about - pixel.fitted, pixel.freedom), detail=bumps_note)
         if turn == 0:
             waves, pixel = _waves(about - fov.fitted, q_icrs_to_cam, scale, extent, bumps)
         if waves is None:
             break
         pixel = replace(_component(waves, about - fov.fitted, fov.freedom), detail=pixel.detail)
-    left = about - fov.fitted - pixel.fitted
-    noise = (left**2).sum(axis=0) / max(len(left) - 1 - fov.freedom - pixel.freedom, 1.0)
-    return Components(mean, fov, pixel, noise, left, extent)
+    residual = about - fov.fitted - pixel.fitted
+    noise = (residual**2).sum(axis=0) / max(len(residual) - 1 - fov.freedom - pixel.freedom, 1.0)
+    return Components(mean, fov, pixel, noise, residual, extent)
 
 
 def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -> Component:
     """The fit of functions to (n, 3), and its variance less the noise in it."""
-    n, fitted = len(wanted), functions.fit(wanted)
+    n = len(wanted)
+    fitted = functions.fit(wanted)
     noise = ((wanted - fitted) ** 2).sum(axis=0) / max(
         n - 1 - functions.freedom - other_freedom, 1.0
     )
@@ -189,8 +194,8 @@ def _waves(
         )
         return None, replace(none, reason=reason)
     freedom = 0.0 if bumps is None else bumps.freedom
-    waves, found, best = _best_of(tried, about, freedom)
-    power = _surely(found, about, freedom, 0.0)
+    waves, component, best = _best_of(tried, about, freedom)
+    power = _surely(component, about, freedom, 0.0)
     for spacing in LOCAL_SPACINGS_PX:
         columns = local_columns(q_icrs_to_cam, scale, spacing)
         if columns.shape[1] > min(MAX_LOCAL, len(about) // ROWS_A_BUMP):
@@ -199,7 +204,10 @@ def _waves(
         fit = replace(_component(local, about, freedom), detail=f"{LOCAL}, {spacing:.0f} px apart")
         explained = _surely(fit, about, freedom, SURE)
         if explained > power:
-            power, waves, found, best = explained, local, fit, None
+            power = explained
+            waves = local
+            component = fit
+            best = None
         elif explained < HOPELESS * power:
             break
     if waves is None:
@@ -209,11 +217,11 @@ def _waves(
         edges = edges_of(best, base, about)
         if edges.shape[1]:
             waves = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
-            found = replace(
+            component = replace(
                 _component(waves, about, freedom),
-                detail=f"{found.detail}, with {edges.shape[1]} {EDGES}",
+                detail=f"{component.detail}, with {edges.shape[1]} {EDGES}",
             )
-    return waves, found
+    return waves, component
 
 
 def _best_of(
@@ -222,8 +230,10 @@ def _best_of(
     """Of the waves of one direction those that explain most of residuals (n, 3) beyond noise;
     None where none does.
     """
-    power, waves, best = 0.0, None, None
-    found = Component(NOTHING, np.zeros_like(about), 0.0)
+    power = 0.0
+    waves = None
+    best = None
+    component = Component(NOTHING, np.zeros_like(about), 0.0)
     # With answers enough those of an error that jumps from pixel to pixel are tried as well.
     kinds = [(HARMONICS, ""), (SHARP_HARMONICS, SHARP)][
         : 1 + (len(about) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP)
@@ -236,22 +246,28 @@ def _best_of(
                 fit, about, freedom, SURE_OF_MANY if phases.name == SOUGHT else SURE
             )
             if explained > power:
-                power, waves, found, best = explained, mine, fit, phases
-    return waves, found, best
+                power = explained
+                waves = mine
+                component = fit
+                best = phases
+    return waves, component, best
 
 
 def _apart(columns: FloatArray, bumps: Projector) -> float:
     """The share of the power of some waves that no bump explains."""
     columns = columns - columns.mean(axis=0)
     power = float((columns**2).sum())
-    return float(((columns - bumps.fit(columns)) ** 2).sum()) / power if power > 0 else 0.0
+    if power > 0:
+        return float(((columns - bumps.fit(columns)) ** 2).sum()) / power
+    return 0.0
 
 
 def _surely(found: Component, about: FloatArray, other_freedom: float, sure: float) -> float:
     """The power explained beyond noise, in units of the noise's variance; 0 where noise alone
     may explain as much.
     """
-    n, freedom = len(about), max(found.freedom, 1.0)
+    n = len(about)
+    freedom = max(found.freedom, 1.0)
     noise = ((about - found.fitted) ** 2).sum(axis=0) / max(n - freedom - other_freedom, 1.0)
     excess = n * float((found.variance / np.maximum(noise, 1e-12)).sum())
     chance = float(np.sqrt(2 * 3 * freedom))
@@ -289,16 +305,17 @@ def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
     highest = max(SHARP_HARMONICS if base.shape[1] == 2 * len(SHARP_HARMONICS) else HARMONICS)[0]
     spectrum[: highest + 1] = 0.0  # these are in the base
     power = float((np.fft.irfft(spectrum, EDGE_STEPS) ** 2).mean())
-    bin_of = [
-        np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1)
-        for u in phases.place_px.T
-    ]
+    bin_of = []
+    for u in phases.place_px.T:
+        bin_of.append(np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1))
     for _ in range(MAX_EDGES):
         fitted = columns @ np.linalg.lstsq(columns, about, rcond=None)[0]
-        left = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
+        standardised = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
         best = (SURE_OF_EDGE, 0, 0)
         for axis, bins in enumerate(bin_of):
-            sums = np.stack([np.bincount(bins, value, minlength=EDGE_STEPS) for value in left.T])
+            sums = np.stack(
+                [np.bincount(bins, value, minlength=EDGE_STEPS) for value in standardised.T]
+            )
             met = np.fft.irfft(np.fft.rfft(sums) * np.conj(spectrum), EDGE_STEPS)
             gain = (met**2).sum(axis=0) / (n * power)
             place = int(np.argmax(gain))
@@ -313,8 +330,8 @@ def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
 
 def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str = "") -> Phases:
     """The phases of a direction (3,), ICRS."""
-    seen = axes @ direction
-    return Phases(name, scale.focal_px * seen[:, :2] / seen[:, 2:])
+    direction_in_cam = axes @ direction
+    return Phases(name, scale.focal_px * direction_in_cam[:, :2] / direction_in_cam[:, 2:])
 
 
 def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Iterator[Phases]:
@@ -335,10 +352,8 @@ def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) ->
         scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1),
     )
     # Right ascension times the cosine of the mean declination, and declination.
-    ra, dec = (
-        np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0])),
-        np.arcsin(np.clip(boresight[:, 2], -1, 1)),
-    )
+    ra = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0]))
+    dec = np.arcsin(np.clip(boresight[:, 2], -1, 1))
     place_px = scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
     yield Phases("the phase of the boresight's right ascension and declination", place_px)
     direction = best_direction(about, axes, scale)
@@ -353,12 +368,15 @@ def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) ->
     centre = centres_of(place, spacing_px)
     direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
     near = bumps_at(place, centre, spacing_px).tocoo()
-    seen = np.einsum("nij,nj->ni", axes[near.row], direction[near.col])
-    phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
-    parts = [
-        sparse.csr_matrix((near.data * column, (near.row, near.col)), shape=near.shape)
-        for column in phase.T
-    ]
+    direction_in_cam = np.einsum("nij,nj->ni", axes[near.row], direction[near.col])
+    phase = Phases("", scale.focal_px * direction_in_cam[:, :2] / direction_in_cam[:, 2:]).columns(
+        LOCAL_HARMONICS
+    )
+    parts = []
+    for column in phase.T:
+        parts.append(
+            sparse.csr_matrix((near.data * column, (near.row, near.col)), shape=near.shape)
+        )
     return sparse.csr_matrix(sparse.hstack(parts))
 
 
@@ -378,10 +396,11 @@ def best_direction(
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)
     frame = np.stack([x, np.cross(z, x), z])
-    seen = boresight @ frame.T
-    trace = seen[:, :2] / seen[:, 2:]
+    in_frame = boresight @ frame.T
+    trace = in_frame[:, :2] / in_frame[:, 2:]
     margin = 0.5 * max(scale.resolution_px) / scale.focal_px
-    low, high = trace.min(axis=0) - margin, trace.max(axis=0) + margin
+    low = trace.min(axis=0) - margin
+    high = trace.max(axis=0) + margin
     step = (high - low) / (GRID - 1)
     best = np.stack(
         np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))), axis=-1
@@ -420,10 +439,11 @@ def _wave_power(
     power = np.zeros(len(directions))
     # Components lie one after the other, each of all rows: products and sums of 3000 rows take a
     # quarter less.
-    value, axes = np.ascontiguousarray(value.T), axes.reshape(-1, 3)
+    value = np.ascontiguousarray(value.T)
+    axes = axes.reshape(-1, 3)
     for k, direction in enumerate(directions):
-        seen = (axes @ direction).reshape(-1, 3).T
-        angle = (2 * np.pi * scale.focal_px) * (seen[:2] / seen[2])
+        direction_in_cam = (axes @ direction).reshape(-1, 3).T
+        angle = (2 * np.pi * scale.focal_px) * (direction_in_cam[:2] / direction_in_cam[2])
         waves = np.concatenate([np.cos(angle), np.sin(angle)])
         sums = np.add.reduceat(value[:, None] * waves, start, axis=-1)
         power[k] = float((sums**2).sum())
@@ -439,13 +459,13 @@ def _stretches(roll_rad: FloatArray, cell_px: float, answers: int) -> tuple[IntA
     total = len(roll_rad)
     by_roll = np.floor(roll_rad / (PHASE_CYCLES / cell_px)).astype(np.int64)
     by_count = np.arange(total) // (total if cell_px < 1 else MAX_STRETCH)
-    kept = [0]
-    for each in np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))[
+    borders = [0]
+    for border in np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))[
         1:
     ].tolist():
-        if each - kept[-1] >= MIN_STRETCH:
-            kept.append(each)
-    start = np.array(kept)
+        if border - borders[-1] >= MIN_STRETCH:
+            borders.append(border)
+    start = np.array(borders)
     if answers >= total:
         return start, np.arange(total)
     end = np.append(start[1:], total)

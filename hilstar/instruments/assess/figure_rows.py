@@ -25,7 +25,10 @@ def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRo
     is None.
     """
     for k, axis in enumerate("xyz"):
-        value = None if parts is None else float(parts.bias_arcsec[k])
+        if parts is None:
+            value = None
+        else:
+            value = float(parts.bias_arcsec[k])
         yield FigureRow(
             "bias",
             axis,
@@ -34,16 +37,16 @@ def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRo
             *([] if parts is None else parts.intervals.bias[:, k].tolist()),
         )
     for part, name in PARTS.items():
-        axes = (
-            noise_arcsec if part == "noise" or parts is None else getattr(parts, f"{part}_arcsec")
-        )
+        if part == "noise" or parts is None:
+            axes = noise_arcsec
+        else:
+            axes = getattr(parts, f"{part}_arcsec")
         for k, axis in enumerate(("cross", "roll")):
             value = getattr(axes, axis)
-            ends = (
-                []
-                if parts is None or value is None
-                else getattr(parts.intervals, part)[:, k].tolist()
-            )
+            if parts is None or value is None:
+                ends = []
+            else:
+                ends = getattr(parts.intervals, part)[:, k].tolist()
             yield FigureRow(name, axis, value, "arcsec", *ends)
 
 

@@ -81,7 +81,9 @@ def verdict_of(found: Assessment) -> Verdict:
     """Whether the tracker was right throughout: BAD with wrong answers or lost locks, WARN with
     missed frames or an availability under AVAILABLE.
     """
-    wrong, lost, missed = len(found.wrong), len(found.lock.lost), found.run.run.missed
+    wrong = len(found.wrong)
+    lost = len(found.lock.lost)
+    missed = found.run.run.missed
     counts = ", ".join(
         (
             _counted(wrong, "wrong answer"),
@@ -157,15 +159,16 @@ def _events(found: Assessment) -> Iterator[Card]:
     """The wrong answers and the outages, folded on the screen."""
     parts = []
     if found.wrong:
-        wrong = [astuple(each) for each in found.wrong[:MAX_ROWS]]
+        wrong = [astuple(answer) for answer in found.wrong[:MAX_ROWS]]
         table = table_of(wrong, WRONG_COLUMNS)
         parts.append(details_of(f"{len(found.wrong)} wrong answers", table, printed=True))
     outages = found.lock.outages
     if outages:
-        rows = [
-            (outage.start_s, outage.length_s, YES[outage.lost], outage.rows, outage.wrong)
-            for outage in outages[:MAX_ROWS]
-        ]
+        rows = []
+        for outage in outages[:MAX_ROWS]:
+            rows.append(
+                (outage.start_s, outage.length_s, YES[outage.lost], outage.rows, outage.wrong)
+            )
         table = table_of(rows, OUTAGE_COLUMNS)
         parts.append(details_of(f"{len(outages)} outages", table, printed=True))
     if parts:
@@ -175,15 +178,18 @@ def _events(found: Assessment) -> Iterator[Card]:
 def _errors(found: Assessment) -> Iterator[Card]:
     """Bias, field-of-view error, pixel error and noise, one sigma an axis."""
     parts = found.found
-    intervals, pixel = parts.intervals, parts.components.pixel
+    intervals = parts.intervals
+    pixel = parts.components.pixel
     low, high = intervals.bias
-    cross, half = parts.bias_arcsec[:2], (high[:2] - low[:2]) / 2
+    cross = parts.bias_arcsec[:2]
+    half = (high[:2] - low[:2]) / 2
     across = float(np.hypot(*cross))
     off = float(np.hypot(*(cross * half))) / max(across, 1e-12)  # to first order
-    biases = [
-        (axis, within(float(parts.bias_arcsec[k]), float(low[k]), float(high[k]), ARCSEC))
-        for k, axis in enumerate(AXES)
-    ]
+    biases = []
+    for k, axis in enumerate(AXES):
+        biases.append(
+            (axis, within(float(parts.bias_arcsec[k]), float(low[k]), float(high[k]), ARCSEC))
+        )
     texts = [table_of(biases), paragraph("95 % intervals in brackets, by the block bootstrap.")]
     bias = KeyFigure(
         measured(across, off, ARCSEC),
@@ -261,7 +267,7 @@ def _slices(found: Assessment) -> Iterator[Card]:
 
 def _slice_table(unit: str, slices: Sequence[Slice]) -> list[str]:
     header = (f"from, {unit}", f"to, {unit}", *SLICE_COLUMNS)
-    rows = [astuple(each) for each in slices]
+    rows = [astuple(rate_slice) for rate_slice in slices]
     return [table_of(rows, header, 3), paragraph("The rms is about the bias.", "small")]
 
 
@@ -282,7 +288,7 @@ def _over_time(found: Assessment) -> str:
     valid = np.flatnonzero(found.telemetry.valid)
     t_s = found.t_s[valid[found.found.row]]
     some = np.unique(np.linspace(0, len(t_s) - 1, MAX_POINTS).astype(int))
-    wrong_s = np.array([each.run_s for each in found.wrong])
+    wrong_s = np.array([answer.run_s for answer in found.wrong])
     repeating = parts.fov.fitted + parts.pixel.fitted
     rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
     finding = (
@@ -312,12 +318,13 @@ def _over_time(found: Assessment) -> str:
                 rasterized=True,
                 label="repeats",
             )
-            for each in found.lock.lost:
+            for answer in found.lock.lost:
                 axes.axvspan(
-                    each.start_s, each.start_s + each.length_s, color=MUTED, alpha=0.15, lw=0
+                    answer.start_s, answer.start_s + answer.length_s, color=MUTED, alpha=0.15, lw=0
                 )
             if found.wrong:
-                height, place = np.full(len(wrong_s), WRONG_HEIGHT), axes.get_xaxis_transform()
+                height = np.full(len(wrong_s), WRONG_HEIGHT)
+                place = axes.get_xaxis_transform()
                 axes.scatter(wrong_s, height, 25, RED, marker="v", transform=place)
             axes.set_ylabel(f"{name} [arcsec]")
             label_ends(axes)
@@ -327,19 +334,20 @@ def _over_time(found: Assessment) -> str:
 
 def _field_map(found: Assessment) -> tuple[str, str]:
     """The map of the field-of-view error, and why there is none."""
-    parts, scale = found.found.components, found.run.scale
+    parts = found.found.components
+    scale = found.run.scale
     axes = to_matrix(found.found.commanded_q)
     some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
     mean = axes[:, 2].mean(axis=0)
     size = float(np.linalg.norm(mean))
-    seen = axes[some] @ (mean / max(size, 1e-9))
-    if parts.fov.reason or seen[:, 2].min() < 0.3:
+    in_field = axes[some] @ (mean / max(size, 1e-9))
+    if parts.fov.reason or in_field[:, 2].min() < 0.3:
         reason = (
             parts.fov.reason
             or "the run goes over too much of the sky for one map: see the chart over time"
         )
         return "", f"no map: {reason}"
-    place = scale.focal_px * seen[:, :2] / seen[:, 2:]
+    place = scale.focal_px * in_field[:, :2] / in_field[:, 2:]
     largest = np.abs(parts.fov.fitted).max(axis=0)
     finding = (
         f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g}"
@@ -347,7 +355,8 @@ def _field_map(found: Assessment) -> tuple[str, str]:
     )
     with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
         for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
-            value, limit = parts.fov.fitted[some, k], max(float(largest[k]), 1e-6)
+            value = parts.fov.fitted[some, k]
+            limit = max(float(largest[k]), 1e-6)
             look: dict[str, Any] = {
                 "cmap": "RdBu_r",
                 "vmin": -limit,
@@ -367,7 +376,8 @@ def _field_map(found: Assessment) -> tuple[str, str]:
 
 def _histogram(found: Assessment) -> str:
     """What is left as noise, beside the normal distribution."""
-    left, variance = found.found.components.left, found.found.components.noise_variance
+    residual = found.found.components.left
+    variance = found.found.components.noise_variance
     sigmas = np.sqrt(variance)
     finding = (
         f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the"
@@ -381,7 +391,7 @@ def _histogram(found: Assessment) -> str:
         for k, (axes, name) in enumerate(zip(panels, AXES, strict=True)):
             sigma = max(float(sigmas[k]), 1e-9)
             edges = np.linspace(-5, 5, 61) * sigma
-            axes.hist(left[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
+            axes.hist(residual[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
             axes.plot(
                 edges,
                 np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),

@@ -55,11 +55,11 @@ def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
     inverse = np.argsort(np.argsort(first))[inverse]
     count = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, column) for column in place.T], axis=1) / count[:, None]
-    kept = np.ones(len(mean), dtype=bool)
+    is_kept = np.ones(len(mean), dtype=bool)
     for a, b in sorted(cKDTree(mean).query_pairs(CLOSE * spacing_px)):
-        if kept[a] and kept[b]:
-            kept[b] = False
-    return np.asarray(mean[kept])
+        if is_kept[a] and is_kept[b]:
+            is_kept[b] = False
+    return np.asarray(mean[is_kept])
 
 
 def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -25,7 +25,8 @@ def budget_of(found: Assessment) -> dict[str, Any]:
     `clock` is the tracker's minus the run's at the run's start, and its excess rate; null where the
     motion does not tell.
     """
-    parts, clock = found.found, found.found.clock
+    parts = found.found
+    clock = found.found.clock
     return {
         "bias_arcsec": parts.bias_arcsec.tolist(),
         "fov_arcsec": parts.fov_arcsec,
@@ -51,7 +52,7 @@ def bench_part(certificate: Certificate, parts: DecomposedRun) -> dict[str, Any]
     and that over the bias.
     """
     bias = np.abs(parts.bias_arcsec)
-    found: dict[str, Any] = {
+    part: dict[str, Any] = {
         "certificate": certificate.number,
         "off_arcsec": None,
         "share_of_bias": None,
@@ -63,25 +64,25 @@ def bench_part(certificate: Certificate, parts: DecomposedRun) -> dict[str, Any]
             (float(np.hypot(*bias[:2])), float(bias[2])),
             strict=True,
         )
-        each = {
-            name: (own, min(own / measured, 1.0) if measured else 1.0)
-            for name, own, measured in sizes
+        shares = {
+            name: (bench_arcsec, min(bench_arcsec / measured, 1.0) if measured else 1.0)
+            for name, bench_arcsec, measured in sizes
         }
-        found["off_arcsec"] = {name: own for name, (own, _) in each.items()}
-        found["share_of_bias"] = {name: share for name, (_, share) in each.items()}
-    return found
+        part["off_arcsec"] = {name: bench_arcsec for name, (bench_arcsec, _) in shares.items()}
+        part["share_of_bias"] = {name: share for name, (_, share) in shares.items()}
+    return part
 
 
 def rows_of(found: Assessment) -> Iterator[FigureRow]:
     """The rows of budget.csv."""
     yield from part_rows(found.found, found.noise_arcsec)
     clock = found.found.clock
-    for name, value, sigma, unit, told in (
+    for name, value, sigma, unit, note in (
         ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
         ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
     ):
         yield FigureRow(
-            name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
+            name, "", value if note else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
         )
     lock = found.lock
     yield FigureRow("availability", "", lock.availability)
@@ -107,19 +108,26 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
 def write_tables(directory: Path, found: Assessment) -> None:
     """Write budget.csv, slices.csv, wrong.csv and outages.csv. Raises InputError."""
     write_csv(directory / "budget.csv", FigureRow._fields, [_plain(row) for row in rows_of(found)])
-    slices = [("rate_deg_s", each) for each in found.by_rate] + [
-        ("field_v_mag", each) for each in found.by_magnitude
+    slices = [("rate_deg_s", row_slice) for row_slice in found.by_rate] + [
+        ("field_v_mag", row_slice) for row_slice in found.by_magnitude
     ]
     names = ["by", *(field.name for field in fields(Slice))]
     write_csv(
-        directory / "slices.csv", names, [_plain((by, *astuple(each))) for by, each in slices]
+        directory / "slices.csv",
+        names,
+        [_plain((by, *astuple(row_slice))) for by, row_slice in slices],
     )
     write_csv(
         directory / "wrong.csv",
         ("row", "t_s", "run_s", "off_deg"),
         [
-            (each.row, repr(each.t_s), f"{each.run_s:.6f}", f"{each.off_deg:.6g}")
-            for each in found.wrong
+            (
+                row_slice.row,
+                repr(row_slice.t_s),
+                f"{row_slice.run_s:.6f}",
+                f"{row_slice.off_deg:.6g}",
+            )
+            for row_slice in found.wrong
         ],
     )
     write_csv(
@@ -141,19 +149,24 @@ def _plain(row: tuple[object, ...]) -> list[object]:
 
 def lines_of(found: Assessment) -> list[tuple[str, str]]:
     """The lines of the assessment on the terminal: name and text."""
-    parts, lock, clock = found.found, found.lock, found.found.clock
+    parts = found.found
+    lock = found.lock
+    clock = found.found.clock
     x, y, z = parts.bias_arcsec.tolist()
-    named = ", ".join(str(each.row) for each in found.wrong[:MAX_NAMED]) + (
+    named = ", ".join(str(answer.row) for answer in found.wrong[:MAX_NAMED]) + (
         ", ..." if len(found.wrong) > MAX_NAMED else ""
     )
-    where = "on lines" if found.telemetry.of_lines else "attitudes"
-    offset = (
-        f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms"
-        if clock.offset_told
-        else "unknown"
-    )
+    if found.telemetry.of_lines:
+        where = "on lines"
+    else:
+        where = "attitudes"
+    if clock.offset_told:
+        offset = f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms"
+    else:
+        offset = "unknown"
     drift = f"{1e6 * clock.drift:.2f} +- {1e6 * clock.sigma_drift:.2g} ppm"
-    share, wait_s = lock.acquisition_probability, lock.acquisition_s
+    share = lock.acquisition_probability
+    wait_s = lock.acquisition_s
     wait = "-" if wait_s is None else f"{wait_s:.3g}"
     answers = (
         f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and"

@@ -130,7 +130,10 @@ def align_files(file: BenchFile, table: Path, ledger: Path | None, offset_s: flo
     """Align a bench by a table of pairs, or by the telemetry of a run with its ledger. Raises
     InputError.
     """
-    pairs = read_pairs(table) if ledger is None else pair_with_ledger(table, ledger, offset_s)
+    if ledger is None:
+        pairs = read_pairs(table)
+    else:
+        pairs = pair_with_ledger(table, ledger, offset_s)
     return align(pairs, bench_camera(file.config, file.folder))
 
 
@@ -141,7 +144,10 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
     ones.
     """
     if len(pairs) < MIN_PAIRS:
-        skipped = f" ({pairs.skipped} more are not valid)" if pairs.skipped else ""
+        if pairs.skipped:
+            skipped = f" ({pairs.skipped} more are not valid)"
+        else:
+            skipped = ""
         raise InputError(
             f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more"
             " attitudes"
@@ -154,7 +160,10 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
             f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of"
             f" {len(pairs)} agree; look for lost stars, and rows of other times"
         )
-    rate_rad_s = None if pairs.rate_rad_s is None else pairs.rate_rad_s[used]
+    if pairs.rate_rad_s is None:
+        rate_rad_s = None
+    else:
+        rate_rad_s = pairs.rate_rad_s[used]
     covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
     return Aligned(
         pairs=pairs,
@@ -189,7 +198,8 @@ def residual_of(
 ) -> Residual:
     """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation."""
     group = groups_of(commanded)
-    cross, roll = residual_rad[:, :2], residual_rad[:, 2:]
+    cross = residual_rad[:, :2]
+    roll = residual_rad[:, 2:]
     dof = max(1.0 - 1.0 / len(group), 0.5)
     rms = AxesArcsec(
         *(ARCSEC_PER_RAD * float(np.sqrt((part**2).mean() / dof)) for part in (cross, roll))
@@ -210,7 +220,9 @@ def residual_of(
 def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
     """The scatter of repeats, and the excess scatter of the attitudes' means over it, arcsec."""
     count = np.bincount(group)
-    pairs, groups, axes = len(group), len(count), part.shape[1]
+    pairs = len(group)
+    groups = len(count)
+    axes = part.shape[1]
     means = _means(part, group)
     within = float(((part - means[group]) ** 2).sum()) / (axes * (pairs - groups))
     repeat = ARCSEC_PER_RAD * float(np.sqrt(within))
@@ -248,7 +260,10 @@ def _causes(
     causes = []
     # A turn n of the reference frame: C R(n) C* is a turn by C n in cam.
     frames = np.stack(
-        [to_matrix(each) for each in commanded[np.unique(group, return_index=True)[1]]]
+        [
+            to_matrix(q_commanded)
+            for q_commanded in commanded[np.unique(group, return_index=True)[1]]
+        ]
     )
     turn = _explained(means, frames)
     if turn is not None:
@@ -290,18 +305,21 @@ def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | No
     weight = 1 / np.array([cross, cross, max(float(scale[2]), FLOOR_RAD)])
     wanted = (residual_rad - residual_rad.mean(axis=0)) * weight
     design = ((columns - columns.mean(axis=0)) * weight[:, None]).reshape(3 * pairs, amounts)
-    found, _, rank, _ = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)
+    solution, _, rank, _ = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)
     free = 3 * pairs - 3 - rank
-    whole, left = float((wanted**2).sum()), float(((wanted.ravel() - design @ found) ** 2).sum())
+    whole = float((wanted**2).sum())
+    unexplained = float(((wanted.ravel() - design @ solution) ** 2).sum())
     if (
         rank < amounts
         or free < 3
-        or left > (1 - MIN_EXPLAINED) * whole
+        or unexplained > (1 - MIN_EXPLAINED) * whole
         or whole < pairs * (FLOOR_RAD / cross) ** 2
     ):
         return None
-    ratio = (whole - left) / amounts / max(left / free, 1e-30)
-    return np.asarray(found) if ratio > _f_limit(amounts, free) else None
+    ratio = (whole - unexplained) / amounts / max(unexplained / free, 1e-30)
+    if ratio > _f_limit(amounts, free):
+        return np.asarray(solution)
+    return None
 
 
 def _f_limit(above: float, below: float) -> float:
@@ -319,11 +337,9 @@ def write_alignment(
     """
     name = file.config.collimator.geometry
     if name is None:
-        camera, notes, lens_of = (
-            found.camera,
-            Notes({}, ErrorTable(model="ideal lens"), MadeTable()),
-            "the bench file",
-        )
+        camera = found.camera
+        notes = Notes({}, ErrorTable(model="ideal lens"), MadeTable())
+        lens_of = "the bench file"
     else:
         # As the file has it: the bench's own camera is bounded to what this screen needs.
         camera = load_geometry(file.folder / name, found.camera.resolution_px)
@@ -383,7 +399,8 @@ def summary_of(found: Aligned) -> dict[str, Any]:
 
 def remarks_of(found: Aligned) -> tuple[str, ...]:
     """What the figures alone do not say."""
-    residual, remarks = found.residual, []
+    residual = found.residual
+    remarks = []
     unexplained = residual.unexplained
     if residual.attitudes == 1:
         remarks.append(ONE_ATTITUDE)
@@ -403,12 +420,20 @@ def remarks_of(found: Aligned) -> tuple[str, ...]:
 
 def lines_of(found: Aligned) -> list[str]:
     """The alignment for a person."""
-    residual, wild, pairs = found.residual, found.wild, found.pairs
+    residual = found.residual
+    wild = found.wild
+    pairs = found.pairs
     parts = zip(found.rotation_arcsec, found.sigma_arcsec, strict=True)
     x, y, z = (f"{value:.2f} +- {sigma:.2f}" for value, sigma in parts)
     named = ", ".join(map(str, wild[:MAX_NAMED])) + (", ..." if len(wild) > MAX_NAMED else "")
-    skipped = f", {pairs.skipped} skipped" if pairs.skipped else ""
-    of = "all of one attitude" if residual.attitudes == 1 else f"of {residual.attitudes} attitudes"
+    if pairs.skipped:
+        skipped = f", {pairs.skipped} skipped"
+    else:
+        skipped = ""
+    if residual.attitudes == 1:
+        of = "all of one attitude"
+    else:
+        of = f"of {residual.attitudes} attitudes"
     rows = [
         ("pairs", f"{int(found.fit.used.sum())} of {len(pairs)} used, {of}{skipped}"),
         ("wild", f"{len(wild)}, on lines {named}" if wild else "none"),

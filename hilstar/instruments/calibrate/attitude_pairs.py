@@ -100,10 +100,8 @@ def read_pairs(path: Path) -> Pairs:
         numbers.append(finite_numbers(path, line, columns, cells[:-1], SKIP))
         if len(lines) > MAX_ROWS:
             raise InputError(f"{path}: more than {MAX_ROWS} rows; write fewer")
-    line_of, both = (
-        np.array(lines, dtype=np.intp),
-        np.array(numbers).reshape(len(lines), len(columns)),
-    )
+    line_of = np.array(lines, dtype=np.intp)
+    both = np.array(numbers).reshape(len(lines), len(columns))
     commanded = _unit(path, line_of, both[:, :4], COMMANDED)
     return Pairs(path, line_of, commanded, _unit(path, line_of, both[:, 4:], REPORTED), skipped)
 
@@ -131,7 +129,8 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
     or within a gap or a jump of the frames are skipped. Raises InputError for telemetry or a ledger
     that cannot be read, and where no row is left.
     """
-    telemetry, run = read_telemetry(path, rising=False), read_commanded(ledger)
+    telemetry = read_telemetry(path, rising=False)
+    run = read_commanded(ledger)
     valid = telemetry.valid
     t_s = run.seconds(telemetry.t_ns[valid] + round(offset_s * NS_PER_S))
     moments = run.commanded.at(t_s)
@@ -190,7 +189,9 @@ def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     to it, rad.
     """
     chosen = np.unique(np.linspace(0, len(rotations) - 1, STARTS).astype(int))
-    best, angles, reach = rotations[0], np.zeros(len(rotations)), np.inf
+    best = rotations[0]
+    angles = np.zeros(len(rotations))
+    reach = np.inf
     for candidate in rotations[chosen]:
         cosine = np.abs(rotations @ candidate)
         # The chord is exact for tiny angles, where the cosine is not.
@@ -205,7 +206,9 @@ def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
         )
         half = float(np.quantile(angle, 0.5, method="higher"))
         if half < reach:
-            best, angles, reach = candidate, angle, half
+            best = candidate
+            angles = angle
+            reach = half
     return best, angles
 
 
@@ -240,7 +243,9 @@ def _weights(residual: FloatArray, near: npt.NDArray[np.bool_], cut: float) -> F
     roll = max(MAD_TO_SIGMA * float(np.median(off[:, 2])), FLOOR_RAD)
     squared = (residual[:, 0] ** 2 + residual[:, 1] ** 2) / cross**2 + residual[:, 2] ** 2 / roll**2
     weight = np.where(near & (squared < cut**2), (1 - squared / cut**2) ** 2, 0.0)
-    return weight if weight.any() else near.astype(np.float64)
+    if weight.any():
+        return weight
+    return near.astype(np.float64)
 
 
 def _as_is(q: FloatArray) -> FloatArray:
@@ -288,16 +293,17 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
     Also where the rotation would turn the screen, of `field_radius_rad`, out of the tracker's view.
     """
     few = np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).astype(int))
-    commanded, reported = pairs.commanded[few], pairs.reported[few]
+    commanded = pairs.commanded[few]
+    reported = pairs.reported[few]
     rotation, spread = _spread(commanded, reported)
     out_of_view = _boresight_rad(rotation) > field_radius_rad
-    found = []
+    cures = []
     for change_commanded, change_reported, cure in _conventions(pairs.names):
         other, reach = _spread(change_commanded(commanded), change_reported(reported))
         if reach <= AGREE_RAD and _boresight_rad(other) <= field_radius_rad:
-            found.append((reach, cure))
-    best = min((reach for reach, _ in found), default=np.inf)
-    cure = next((cure for reach, cure in found if reach <= SIMPLER * best), "")
+            cures.append((reach, cure))
+    best = min((reach for reach, _ in cures), default=np.inf)
+    cure = next((cure for reach, cure in cures if reach <= SIMPLER * best), "")
     agrees = spread <= AGREE_RAD
     if cure and (not agrees or out_of_view or (spread > CLEARLY_RAD and CLEARLY * best < spread)):
         raise InputError(

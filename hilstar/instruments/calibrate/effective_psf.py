@@ -133,8 +133,9 @@ def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray)
     """
     from scipy.interpolate import BSpline
 
-    one = BSpline.basis_element(np.arange(-2, 3) * KNOT_PX, extrapolate=False)
-    whole, end_px = one.antiderivative(), 2 * KNOT_PX
+    basis_spline = BSpline.basis_element(np.arange(-2, 3) * KNOT_PX, extrapolate=False)
+    whole = basis_spline.antiderivative()
+    end_px = 2 * KNOT_PX
     half = np.maximum(side_px, 1e-3)[:, None, None] / 2
     off = offset_px[:, :, None] - knots_px
     high, low = (whole(np.clip(off + step, -end_px, end_px)) for step in (half, -half))
@@ -148,15 +149,18 @@ def effective_psf(
     config = file.config
     nominal = nominal_of(file)
     dots = read_plan(plan)
-    seen = measure_images(images, dark, config.tracker.resolution_px, dot_sigma_px(file))
-    look = first_look(dots, nominal, seen, np.random.default_rng(SEED))
-    _, data = matched(dots, nominal, seen, look)
+    observed = measure_images(images, dark, config.tracker.resolution_px, dot_sigma_px(file))
+    look = first_look(dots, nominal, observed, np.random.default_rng(SEED))
+    _, data = matched(dots, nominal, observed, look)
     if len(np.unique(data.dot)) < MIN_DOTS:
         raise InputError(
             f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed; show more"
             " dots or frames"
         )
-    under = None if dark is None else read_image(dark, config.tracker.resolution_px)
+    if dark is None:
+        under = None
+    else:
+        under = read_image(dark, config.tracker.resolution_px)
     sides = _dot_sides(data, dots.x_px, dots.y_px)
     cut = cut_out(numbered(images), config.tracker.resolution_px, under, data, sides)
     return fit_effective(cut, per_px)
@@ -167,7 +171,8 @@ def _dot_sides(data: MatchedDots, x_px: FloatArray, y_px: FloatArray) -> FloatAr
     to the monitor.
     """
     place = np.stack([data.seen.x_px, data.seen.y_px], axis=1)
-    middle, scale = place.mean(axis=0), float(np.abs(place - place.mean(axis=0)).max())
+    middle = place.mean(axis=0)
+    scale = float(np.abs(place - place.mean(axis=0)).max())
     powers = [(i, j) for i in range(4) for j in range(4 - i) if len(data) > 40 or i + j < 2]
     u, v = ((place - middle) / scale).T
     terms = np.stack([u**i * v**j for i, j in powers], axis=1)
@@ -195,7 +200,8 @@ def cut_out(
         np.bincount(which, part) / count for part in (data.seen.x_px, data.seen.y_px, sides_px)
     )
     reach = MAX_HALF_PX
-    column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
+    column = np.rint(x_px).astype(np.intp)
+    row = np.rint(y_px).astype(np.intp)
     total, squares, lit = (
         np.zeros((len(count), *size)) for size in ((2 * reach + 1,) * 2, (2 * reach + 1,) * 2, ())
     )
@@ -206,17 +212,18 @@ def cut_out(
             continue
         image = read_image(path, resolution_px)
         image = np.pad(image if dark is None else image - dark, reach, constant_values=np.nan)
-        x, y = data.seen.x_px[here], data.seen.y_px[here]
+        x = data.seen.x_px[here]
+        y = data.seen.y_px[here]
         apart = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) + np.where(
             np.eye(len(here)), np.inf, 0
         )
         alone = which[here[apart.min(axis=1, initial=np.inf) > 2 * MAX_HALF_PX]]
-        found = image[
+        cutouts = image[
             (row[alone, None] + reach + steps)[:, :, None],
             (column[alone, None] + reach + steps)[:, None, :],
         ]
-        total[alone] += found
-        squares[alone] += found**2
+        total[alone] += cutouts
+        squares[alone] += cutouts**2
         lit[alone] += 1
     return _of_frames((total, squares, lit), (column, row, x_px, y_px, side_px))
 
@@ -229,12 +236,13 @@ def dots_of_image(image: FloatArray, x_px: FloatArray, y_px: FloatArray, side_px
     apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px)) + np.where(
         np.eye(len(x_px)), np.inf, 0
     )
-    column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
+    column = np.rint(x_px).astype(np.intp)
+    row = np.rint(y_px).astype(np.intp)
     steps = np.arange(2 * MAX_HALF_PX + 1)
-    found = padded[(row[:, None] + steps)[:, :, None], (column[:, None] + steps)[:, None, :]]
+    cutouts = padded[(row[:, None] + steps)[:, :, None], (column[:, None] + steps)[:, None, :]]
     lit = np.where(apart.min(axis=1, initial=np.inf) > 2 * MAX_HALF_PX, 1.0, 0.0)
     return _of_frames(
-        (found, found**2, lit), (column, row, x_px, y_px, np.full(len(x_px), side_px))
+        (cutouts, cutouts**2, lit), (column, row, x_px, y_px, np.full(len(x_px), side_px))
     )
 
 
@@ -243,16 +251,16 @@ def _of_frames(sums: tuple[FloatArray, FloatArray, FloatArray], places: tuple[An
     InputError for too few.
     """
     total, squares, lit = sums
-    kept = np.flatnonzero((lit > 0) & np.isfinite(total).all(axis=(1, 2)))
-    if len(kept) < MIN_DOTS:
+    usable = np.flatnonzero((lit > 0) & np.isfinite(total).all(axis=(1, 2)))
+    if len(usable) < MIN_DOTS:
         raise InputError(
-            f"{len(kept)} dots stand alone by {2 * MAX_HALF_PX} px in some frame, and {MIN_DOTS}"
+            f"{len(usable)} dots stand alone by {2 * MAX_HALF_PX} px in some frame, and {MIN_DOTS}"
             " are needed; plan fewer --dots in a frame"
         )
-    mean = total[kept] / lit[kept, None, None]
-    spread = squares[kept] / lit[kept, None, None] - mean**2
-    variance = _variance(mean, spread, lit[kept]) / lit[kept, None, None]
-    dots = Dots(mean, variance, *(part[kept] for part in places))
+    mean = total[usable] / lit[usable, None, None]
+    spread = squares[usable] / lit[usable, None, None] - mean**2
+    variance = _variance(mean, spread, lit[usable]) / lit[usable, None, None]
+    dots = Dots(mean, variance, *(part[usable] for part in places))
     half = _half_px(dots)
     inner = slice(MAX_HALF_PX - half, MAX_HALF_PX + half + 1)
     return replace(dots, images=mean[:, inner, inner], variance=variance[:, inner, inner])
@@ -268,11 +276,15 @@ def _variance(mean: FloatArray, spread: FloatArray, lit: FloatArray) -> FloatArr
         edge = np.concatenate([mean[:, 0].ravel(), mean[:, -1].ravel()])
         return np.full(mean.shape, float(np.var(edge)) + QUANTISED_DN2)
     unbiased = (spread[again] * (lit[again] / (lit[again] - 1))[:, None, None]).ravel()
-    own = light[again].ravel()
-    dim = own < np.median(own) + 0.1 * np.ptp(own)
+    lone_light = light[again].ravel()
+    dim = lone_light < np.median(lone_light) + 0.1 * np.ptp(lone_light)
     flat = max(float(unbiased[dim].mean()), QUANTISED_DN2)
     slope = max(
-        float(((unbiased - flat) * own)[~dim].sum() / max((own[~dim] ** 2).sum(), 1e-300)), 0.0
+        float(
+            ((unbiased - flat) * lone_light)[~dim].sum()
+            / max((lone_light[~dim] ** 2).sum(), 1e-300)
+        ),
+        0.0,
     )
     return flat + slope * light.clip(min=0)
 
@@ -284,11 +296,13 @@ def _half_px(dots: Dots) -> int:
     flux = (dots.images - dots.images[:, :1].mean(axis=(1, 2), keepdims=True)).reshape(
         len(dots.images), -1
     )
-    flux, variance = flux.sum(axis=0), dots.variance.reshape(len(dots.images), -1).sum(axis=0)
+    flux = flux.sum(axis=0)
+    variance = dots.variance.reshape(len(dots.images), -1).sum(axis=0)
     size = np.bincount(ring)
-    mean, sigma = np.bincount(ring, flux) / size, np.sqrt(np.bincount(ring, variance)) / size
-    seen = np.flatnonzero((mean > SEEN_SIGMAS * sigma) & (mean > SEEN_SHARE * mean[0]))
-    return int(np.clip(seen.max(initial=0) + 2, MIN_HALF_PX, MAX_HALF_PX))
+    mean = np.bincount(ring, flux) / size
+    sigma = np.sqrt(np.bincount(ring, variance)) / size
+    visible = np.flatnonzero((mean > SEEN_SIGMAS * sigma) & (mean > SEEN_SHARE * mean[0]))
+    return int(np.clip(visible.max(initial=0) + 2, MIN_HALF_PX, MAX_HALF_PX))
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,10 +337,8 @@ def fit_effective(dots: Dots, per_px: int) -> Found:
     for dots that are none.
     """
     place = np.stack([dots.x_px, dots.y_px], axis=1)
-    middle, scale = (
-        (place.max(axis=0) + place.min(axis=0)) / 2,
-        max(float(np.ptp(place, axis=0).max()) / 2, 1.0),
-    )
+    middle = (place.max(axis=0) + place.min(axis=0)) / 2
+    scale = max(float(np.ptp(place, axis=0).max()) / 2, 1.0)
     dots, covariance = _each_gaussian(dots)
     degrees = [
         d for d in range(MAX_DEGREE + 1) if (d + 1) * (d + 2) // 2 * DOTS_A_TERM <= len(place)
@@ -338,18 +350,17 @@ def fit_effective(dots: Dots, per_px: int) -> Found:
         _held_out(start, dots, covariance, fold, 0),
         *(_held_out(start, dots, covariance, fold, n) for n in counts),
     ]
-    gaussian, best = models[0], min(models[1:], key=lambda model: float(model.chi2.mean()))
+    gaussian = models[0]
+    best = min(models[1:], key=lambda model: float(model.chi2.mean()))
     gain = gaussian.chi2 - best.chi2
     asks = bool(gain.mean() > ASKS_SIGMAS * gain.std(ddof=1) / np.sqrt(len(gain)))
     chosen = best if asks else gaussian
     final, _ = _fitted(start, dots, covariance, counts[models.index(best) - 1] if asks else 0)
     half = dots.images.shape[1] // 2
-    found, variance = (
-        _glass(final, place, half, per_px),
-        final.covariance[0, :XY].clip(min=MIN_VARIANCE_PX2),
-    )
+    glass = _glass(final, place, half, per_px)
+    variance = final.covariance[0, :XY].clip(min=MIN_VARIANCE_PX2)
     return Found(
-        found,
+        glass,
         models,
         chosen,
         asks,
@@ -383,7 +394,9 @@ def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]
     """Dots with their places by a model, its shares (n, s, s), and their light and background
     (n, 2).
     """
-    x_px, y_px, weight = dots.x_px, dots.y_px, 1 / dots.variance
+    x_px = dots.x_px
+    y_px = dots.y_px
+    weight = 1 / dots.variance
     for _ in range(PLACE_ROUNDS):
         shares = model.of(x_px, y_px, dots.offsets, dots.side_px)
         columns = [shares, np.ones_like(shares)]
@@ -431,7 +444,8 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
     )
     across, down = (_functions(gaussian.knots_px, off, dots.side_px) for off in dots.offsets)
     place = (np.stack([dots.x_px, dots.y_px], axis=1) - gaussian.middle_px) / gaussian.scale_px
-    terms, size = terms_of(place, count), len(gaussian.knots_px)
+    terms = terms_of(place, count)
+    size = len(gaussian.knots_px)
 
     def forward(coefficients: FloatArray) -> FloatArray:
         of_dot = np.tensordot(terms, coefficients.reshape(count, size, size), axes=1)
@@ -444,7 +458,7 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
     operator = LinearOperator(
         (sigma.size, count * size * size), matvec=forward, rmatvec=backward, dtype=np.float64
     )
-    found = lsqr(
+    solution = lsqr(
         operator,
         (rest / sigma).ravel(),
         damp=1 / PRIOR_SHARE,
@@ -452,7 +466,7 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
         atol=1e-5,
         btol=1e-5,
     )[0]
-    return np.asarray(found.reshape(count, size, size))
+    return np.asarray(solution.reshape(count, size, size))
 
 
 def _held_out(
@@ -463,30 +477,32 @@ def _held_out(
     """
     chi2, rms, noise = (np.zeros(len(fold)) for _ in range(3))
     for number in range(FOLDS):
-        known, held = np.flatnonzero(fold != number), np.flatnonzero(fold == number)
+        known = np.flatnonzero(fold != number)
+        held = np.flatnonzero(fold == number)
         model, _ = _fitted(start, dots.at(known), covariance[known], count)
-        own, shares, amplitudes = _placed(model, dots.at(held))
+        own_stamps, shares, amplitudes = _placed(model, dots.at(held))
         flux, background = amplitudes.T[:, :, None, None]
-        off, peak = (
-            own.images - background - flux * shares,
-            np.abs(flux[:, 0, 0]) * shares.max(axis=(1, 2)),
-        )
-        chi2[held] = (off**2 / own.variance).mean(axis=(1, 2))
+        off = own_stamps.images - background - flux * shares
+        peak = np.abs(flux[:, 0, 0]) * shares.max(axis=(1, 2))
+        chi2[held] = (off**2 / own_stamps.variance).mean(axis=(1, 2))
         rms[held] = np.sqrt((off**2).mean(axis=(1, 2))) / peak
-        noise[held] = np.sqrt(own.variance.mean(axis=(1, 2))) / peak
-    name = (
-        f"spline, {('constant', 'linear', 'quadratic')[(1, 3, 6).index(count)]} over the field"
-        if count
-        else "Gaussian"
-    )
+        noise[held] = np.sqrt(own_stamps.variance.mean(axis=(1, 2))) / peak
+    if count:
+        name = (
+            f"spline, {('constant', 'linear', 'quadratic')[(1, 3, 6).index(count)]} over the field"
+        )
+    else:
+        name = "Gaussian"
     return HeldOut(name, float(np.sqrt(np.mean(rms**2))), float(np.sqrt(np.mean(noise**2))), chi2)
 
 
 def _glass(model: Effective, place: FloatArray, half_px: int, per_px: int) -> Glass:
     """The model at points over the dots' field, each with its centroid in the middle."""
-    low, high = place.min(axis=0), place.max(axis=0)
+    low = place.min(axis=0)
+    high = place.max(axis=0)
     x_px, y_px = (part.ravel() for part in np.meshgrid(*np.linspace(low, high, POINTS).T))
-    steps, none = np.arange(-half_px * per_px, half_px * per_px + 1) / per_px, np.zeros(len(x_px))
+    steps = np.arange(-half_px * per_px, half_px * per_px + 1) / per_px
+    none = np.zeros(len(x_px))
     off = [np.tile(steps, (len(x_px), 1)) for _ in (0, 1)]
     for _ in range(3):
         images = model.of(x_px, y_px, (off[0], off[1]), none)
@@ -527,10 +543,11 @@ def draw_effective(path: Path, found: Found) -> None:
 
 def summary_of(found: Found) -> dict[str, Any]:
     """The figures of an effective PSF, by the keys of --json."""
-    models = [
-        {"name": m.name, "rms": m.rms, "noise": m.noise, "reduced_chi2": float(m.chi2.mean())}
-        for m in found.models
-    ]
+    models = []
+    for m in found.models:
+        models.append(
+            {"name": m.name, "rms": m.rms, "noise": m.noise, "reduced_chi2": float(m.chi2.mean())}
+        )
     return {
         "dots": found.dots,
         "half_px": found.half_px,

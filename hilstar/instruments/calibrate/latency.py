@@ -63,20 +63,20 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
     delay stays in the latency. Raises InputError where there are too few.
     """
     lines = read_lines(port, baud, seconds)
-    found = [
+    edges = [
         (host_ns, match)
         for host_ns, line in lines
         if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))
     ]
-    if len(found) < MIN_EDGES:
+    if len(edges) < MIN_EDGES:
         raise InputError(
-            f"serial:{port}@{baud}: {len(found)} edges came, and at least {MIN_EDGES} are needed;"
+            f"serial:{port}@{baud}: {len(edges)} edges came, and at least {MIN_EDGES} are needed;"
             f" {DEVICE_FORM}"
         )
-    host_ns = np.array([host for host, _ in found], dtype=np.int64)
-    level = np.array([int(match[1]) for _, match in found], dtype=np.int64)
-    if all(match[2] is not None for _, match in found):
-        device_ns = [int(match[2]) * NS_PER_US for _, match in found]
+    host_ns = np.array([host for host, _ in edges], dtype=np.int64)
+    level = np.array([int(match[1]) for _, match in edges], dtype=np.int64)
+    if all(match[2] is not None for _, match in edges):
+        device_ns = [int(match[2]) * NS_PER_US for _, match in edges]
         clock = OneWayFilter()
         for host, device in zip(host_ns.tolist(), device_ns, strict=True):
             clock.observe(host, host - device)
@@ -141,21 +141,27 @@ def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
     inside = (seen.host_ns >= shown.host_ns[0] - MAX_EARLY_NS) & (
         seen.host_ns <= shown.host_ns[-1] + MAX_LATENCY_NS
     )
-    host_ns, level = seen.host_ns[inside], seen.level[inside]
+    host_ns = seen.host_ns[inside]
+    level = seen.level[inside]
     guess_ns, ambiguous = _likely_latency_ns(Edges(host_ns, level), shown)
-    latency, kept = [], []
+    latency = []
+    agreeing = []
     for value in (0, 1):
-        causes, mine = shown.host_ns[shown.level == value], host_ns[level == value]
+        causes = shown.host_ns[shown.level == value]
+        mine = host_ns[level == value]
         if len(causes) and len(mine):
             delay = mine - nearest_of(causes, mine - guess_ns)
             good = np.abs(delay - guess_ns) < period_ns / 2
             latency.append(delay[good].astype(np.float64))
-            kept.append(np.full(int(good.sum()), value))
-    found = np.concatenate(latency) if latency else np.zeros(0)
-    if len(found) < max(MIN_EDGES, AGREEING_SHARE * len(host_ns)):
-        fit = f"{len(found)} of {len(host_ns)} edges fit the run's frames"
+            agreeing.append(np.full(int(good.sum()), value))
+    if latency:
+        latencies = np.concatenate(latency)
+    else:
+        latencies = np.zeros(0)
+    if len(latencies) < max(MIN_EDGES, AGREEING_SHARE * len(host_ns)):
+        fit = f"{len(latencies)} of {len(host_ns)} edges fit the run's frames"
         raise InputError(f"{fit}; record the edges during the run, on the same machine")
-    return Paired(found, np.concatenate(kept), len(host_ns) - len(found), ambiguous)
+    return Paired(latencies, np.concatenate(agreeing), len(host_ns) - len(latencies), ambiguous)
 
 
 def nearest_of(moments: IntArray, wanted: FloatArray) -> IntArray:
@@ -173,7 +179,8 @@ def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
     bins = (MAX_LATENCY_NS + MAX_EARLY_NS) // BIN_NS
     counts = np.zeros(bins, dtype=np.int64)
     for value in (0, 1):
-        causes, mine = shown.host_ns[shown.level == value], seen.host_ns[seen.level == value]
+        causes = shown.host_ns[shown.level == value]
+        mine = seen.host_ns[seen.level == value]
         begin = np.searchsorted(causes, mine - MAX_LATENCY_NS)
         end = np.searchsorted(causes, mine + MAX_EARLY_NS, side="right")
         for edge_ns, a, b in zip(mine, begin, end, strict=True):
@@ -266,14 +273,16 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[
         raise InputError(
             f"{ledger}: its header has no bench file that can be read; record the run again"
         )
-    swap_ns, level, seen = array("q"), array("b"), False
+    swap_ns = array("q")
+    level = array("b")
+    is_lit = False
     for record in run_records(ledger):
         if isinstance(record, FrameRecord):
-            seen = True
+            is_lit = True
             if record.marker is not None:
                 swap_ns.append(record.swap_ns)
                 level.append(record.marker)
-    if not seen:
+    if not is_lit:
         raise InputError(f"the run {NO_FRAMES}")
     if not level:
         raise InputError(
@@ -291,10 +300,17 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[
 
 def latency_lines(summary: dict[str, Any]) -> list[str]:
     """The figures as lines of text."""
-    latency, turn = summary["latency_ms"], summary["beat"]
-    every = "none" if turn["period_s"] is None else f"every {turn['period_s']:.3g} s"
+    latency = summary["latency_ms"]
+    turn = summary["beat"]
+    if turn["period_s"] is None:
+        every = "none"
+    else:
+        every = f"every {turn['period_s']:.3g} s"
     worst = turn["worst_arcsec_per_deg_s"]
-    cost = "-" if worst is None else f"at most {worst:.2g} arcsec at 1 deg/s"
+    if worst is None:
+        cost = "-"
+    else:
+        cost = f"at most {worst:.2g} arcsec at 1 deg/s"
     rise, fall = (
         "-" if value is None else f"{value:.2f}"
         for value in (summary["rise_ms"], summary["fall_ms"])
@@ -322,7 +338,8 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
 
 def draw_latency(path: Path, paired: Paired, summary: dict[str, Any]) -> None:
     """Draw a histogram of the latencies by level."""
-    middle, jitter = summary["latency_ms"]["p50"], summary["jitter_ms"]
+    middle = summary["latency_ms"]["p50"]
+    jitter = summary["jitter_ms"]
     with chart(path, f"From swap to light: {middle:.2f} ms, jitter {jitter:.3f} ms") as (axes,):
         ms = paired.latency_ns / NS_PER_MS
         bins = np.linspace(ms.min(), max(ms.max(), ms.min() + 1e-3), BINS).tolist()

@@ -148,10 +148,9 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
             f"{path}: t_s is empty in some rows; give it in every row or leave the column out"
         )
     time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
-    clipped = {
-        name: _clipped(codes[channel == name], reading[channel == name])
-        for name in set(channel.tolist())
-    }
+    clipped = {}
+    for name in set(channel.tolist()):
+        clipped[name] = _clipped(codes[channel == name], reading[channel == name])
     digest = hashlib.sha256(raw).hexdigest()
     return Measurements(
         source=str(path),
@@ -254,7 +253,9 @@ def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
     """
     at_limit = reading == reading.max()
     codes = np.unique(code[at_limit])
-    return [int(c) for c in codes] if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES else []
+    if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES:
+        return [int(c) for c in codes]
+    return []
 
 
 def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
@@ -278,7 +279,10 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
         if dof >= BRIGHT_DOF:
             square = max(float((squares[part] / mean[part] ** 2).sum()), 0.0)
             relative = max(math.sqrt(square / dof), floor)
-    additive = 0.0 if variance.any() else _additive(squares, mean, count, relative)
+    if variance.any():
+        additive = 0.0
+    else:
+        additive = _additive(squares, mean, count, relative)
     common = np.zeros((len(code), measured.common.shape[1]))
     np.add.at(common, place, measured.common[chosen])
     return MeasuredLevels(
@@ -384,7 +388,8 @@ def drift_over_run(measured: Measurements) -> tuple[float, float]:
         [CHANNELS.index(str(name)) for name in measured.channel[lit]]
     )
     _, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    log_light, time = np.log(measured.value[lit]), measured.time[lit]
+    log_light = np.log(measured.value[lit])
+    time = measured.time[lit]
     within = [values - (np.bincount(place, values) / count)[place] for values in (log_light, time)]
     leverage = float((within[1] ** 2).sum())
     span = float(np.ptp(measured.time))

@@ -187,9 +187,13 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     """The response to levels that have passed `check_levels`, for codes 0 to `white`."""
     noise = levels.relative_noise
     if math.isnan(noise):
-        noise = 0.0 if levels.has_errors else _residual_noise(levels, white)
+        if levels.has_errors:
+            noise = 0.0
+        else:
+            noise = _residual_noise(levels, white)
     best = _best_solution(levels, white, noise)
-    problem, scale = best.problem, float(levels.mean[-1] - levels.mean[0])
+    problem = best.problem
+    scale = float(levels.mean[-1] - levels.mean[0])
     above = np.exp(problem.log_base_codes + problem.at_codes @ best.theta)
     from_white = problem.at_codes - problem.at_codes[-1]
     shape_covariance = best.covariance[: len(best.theta), : len(best.theta)]
@@ -287,17 +291,23 @@ def _problem(
 
     def columns(signal: FloatArray) -> FloatArray:
         spline = _spline((shape.coordinate(signal) - low) / (high - low), knots)
-        return np.hstack([spline, np.log(signal)[:, None]]) if shape.log_term else spline
+        if shape.log_term:
+            return np.hstack([spline, np.log(signal)[:, None]])
+        return spline
 
     fine = (np.arange(400) + 0.5) / 400
     roughness = _spline(fine, knots, shape.order)
     penalty = roughness.T @ roughness / len(fine)
     prior = np.eye(len(penalty)) / PRIOR_SIGMA**2
     if shape.log_term:
-        penalty, prior = np.pad(penalty, (0, 1)), np.pad(prior, (0, 1))
+        penalty = np.pad(penalty, (0, 1))
+        prior = np.pad(prior, (0, 1))
         prior[-1, -1] = 1 / PRIOR_SLOPE_SIGMA**2
     scale = levels.mean[-1] - levels.mean[0]
-    floor = STATED_FLOOR if levels.has_errors else BLACK_FLOOR
+    if levels.has_errors:
+        floor = STATED_FLOOR
+    else:
+        floor = BLACK_FLOOR
     sigma = np.hypot(levels.standard_error(noise) / scale, floor)
     return _Problem(
         at_levels=columns(at),
@@ -327,7 +337,8 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
 
     It is looked for over its whole range, or beside that of the step before.
     """
-    black, stiffness = problem.black, math.nan
+    black = problem.black
+    stiffness = math.nan
     moved = math.inf
     start = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
     normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
@@ -350,7 +361,8 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
         covariance = np.linalg.inv(precision)
         new = covariance @ (design.T @ target)
         moved = float(np.abs(problem.at_levels @ (new[:first] - theta)).max())
-        theta, causes = new[:first], new[first:-1]
+        theta = new[:first]
+        causes = new[first:-1]
         black = max(problem.black + new[-1] * problem.black_sigma, 0.0)
         if moved < SETTLED and step >= 2:
             break
@@ -390,11 +402,14 @@ def _stiffest(problem: _Problem, design: FloatArray, target: FloatArray, before:
     def evidence(stiffness: float) -> float:
         return _evidence(problem, design, target, stiffness)[0]
 
-    grid = LOG_STIFFNESS if math.isnan(before) else before + np.array([-1.0, 0.0, 1.0])
+    if math.isnan(before):
+        grid = LOG_STIFFNESS
+    else:
+        grid = before + np.array([-1.0, 0.0, 1.0])
     best = int(np.argmin([evidence(value) for value in grid]))
     bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    found = minimize_scalar(evidence, bounds=bounds, method="bounded", options={"xatol": 0.02})
-    return float(np.clip(found.x, LOG_STIFFNESS[0], LOG_STIFFNESS[-1]))
+    optimum = minimize_scalar(evidence, bounds=bounds, method="bounded", options={"xatol": 0.02})
+    return float(np.clip(optimum.x, LOG_STIFFNESS[0], LOG_STIFFNESS[-1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -430,11 +445,10 @@ def calibrate_photometric(
     black = float(np.mean([fits[name].black for name in names]))
     columns = {name: black + fits[name].white * fits[name].light for name in names}
     noise = max(fits[name].levels.reading_noise(fits[name].noise_relative) for name in columns)
-    drift_note = (
-        "not known: nothing was repeated"
-        if math.isnan(drift)
-        else f"{100 * drift:+.2f} % over the run"
-    )
+    if math.isnan(drift):
+        drift_note = "not known: nothing was repeated"
+    else:
+        drift_note = f"{100 * drift:+.2f} % over the run"
     text = f"fitted to {measured.name}, sha256 {data.sha256}"
     if output.with_suffix(".csv").resolve() == measured.resolve():
         raise InputError(
@@ -457,7 +471,9 @@ def calibrate_photometric(
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
     # r + g + b against w, above black: at white and codes decades below it
-    additivity, crosstalk, unsure = None, None, None
+    additivity = None
+    crosstalk = None
+    unsure = None
     if len(fits) == len(measurements.CHANNELS):
         together = np.sum(
             [fits[name].white * fits[name].light for name in measurements.PRIMARIES], axis=0
@@ -470,9 +486,12 @@ def calibrate_photometric(
         # A channel's errors are relative to its white, which is as well known as its readings are
         # many.
         off: dict[str, FloatArray] = {}
-        for name, one in fits.items():
-            white_error = one.levels.standard_error(one.noise_relative)[-1] / one.levels.mean[-1]
-            off[name] = np.hypot(one.error[at], white_error)
+        for name, channel_fit in fits.items():
+            white_error = (
+                channel_fit.levels.standard_error(channel_fit.noise_relative)[-1]
+                / channel_fit.levels.mean[-1]
+            )
+            off[name] = np.hypot(channel_fit.error[at], white_error)
         errors = [
             fits[name].white * fits[name].light[at] / together[at] * off[name]
             for name in measurements.PRIMARIES
@@ -568,13 +587,13 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
     sigmas = float(np.percentile(residual / fit.residual_error[shown], 95))
-    found = {
+    figures = {
         "rms": np.sqrt((residual**2).mean()),
         "p95": np.percentile(residual, 95),
         "max": residual.max(),
     }
-    percent = {f"{name}_percent": 100 * float(value) for name, value in found.items()}
-    mag = {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
+    percent = {f"{name}_percent": 100 * float(value) for name, value in figures.items()}
+    mag = {f"{name}_mag": MAG_PER_RELATIVE * float(figures[name]) for name in ("rms", "max")}
     return percent | mag | {"p95_sigmas": sigmas}
 
 
@@ -599,11 +618,11 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     )
     with chart(path, finding, panels=2, note=note) as (response, residual):
         for name, fit in fits.items():
-            colour, code, white = COLOURS[name], fit.levels.code[1:], fit.white
-            level, black = (
-                (fit.levels.mean[1:] - fit.black) / white,
-                max(fit.black / white, MIN_DRAWN_LIGHT),
-            )
+            colour = COLOURS[name]
+            code = fit.levels.code[1:]
+            white = fit.white
+            level = (fit.levels.mean[1:] - fit.black) / white
+            black = max(fit.black / white, MIN_DRAWN_LIGHT)
             codes = np.arange(len(fit.light))
             response.plot(
                 codes[1:],
@@ -611,12 +630,13 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
                 color=colour,
                 label=NAMES[name],
             )
-            kept = level > MIN_DRAWN_LIGHT
+            is_drawn = level > MIN_DRAWN_LIGHT
             response.plot(
-                code[kept], level[kept], "o", color=colour, markersize=4, label="_measured"
+                code[is_drawn], level[is_drawn], "o", color=colour, markersize=4, label="_measured"
             )
             response.axhline(black, color=colour, linewidth=0.8, linestyle=":", label="_black")
-            shown, held = fit.light >= 1e-3, fit.light[code] >= 1e-3
+            shown = fit.light >= 1e-3
+            held = fit.light[code] >= 1e-3
             error = 100 * fit.error[shown]
             residual.fill_between(codes[shown], -error, error, color=colour, alpha=0.15, lw=0)
             residual.plot(code[held], 100 * fit.residual[held], "o", color=colour, markersize=4)

@@ -73,7 +73,8 @@ def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch
     below 1 % of white twice as often, in random order, with black, half and white between every
     eight as a reference for drift.
     """
-    codes, white = planned_codes(settings.bits, settings.levels), 2**settings.bits - 1
+    codes = planned_codes(settings.bits, settings.levels)
+    white = 2**settings.bits - 1
     light = (np.array(codes) / white) ** 2.2
     faint = [code for code, is_faint in zip(codes, light < FAINT_LIGHT, strict=True) if is_faint]
     drawn = [
@@ -113,9 +114,9 @@ def write_plan(path: Path, patches: list[Patch]) -> None:
     """Write PLAN.csv, order,code,channel,value with value left empty. Raises InputError where it
     cannot be written.
     """
-    rows = [
-        f"{order},{patch.code},{patch.channel}," for order, patch in enumerate(patches, start=1)
-    ]
+    rows = []
+    for order, patch in enumerate(patches, start=1):
+        rows.append(f"{order},{patch.code},{patch.channel},")
     write_whole(path, "\n".join(["order,code,channel,value", *rows]) + "\n")
 
 
@@ -140,7 +141,8 @@ def patch_image(
     """
     width, height = resolution_px
     side = max(1, round(min(width, height) * PATCH_SHARE))
-    top, left = (height - side) // 2, (width - side) // 2
+    top = (height - side) // 2
+    left = (width - side) // 2
     grey = np.zeros((height, width), dtype=code_dtype(bits))
     grey[top : top + side, left : left + side] = patch.code
     return in_channel(grey, patch.channel)

@@ -78,7 +78,10 @@ def scale_of(white_e_per_s: float, ratios: FloatArray, noise_mag: FloatArray) ->
     `noise_mag` (n,) is the noise of each, 0 where it is not known, and then all have one weight.
     """
     is_known = bool((noise_mag > 0).all())
-    weights = 1 / (noise_mag**2 + STAR_MAG**2) if is_known else np.ones_like(ratios)
+    if is_known:
+        weights = 1 / (noise_mag**2 + STAR_MAG**2)
+    else:
+        weights = np.ones_like(ratios)
     order = np.argsort(ratios, kind="stable")
     below = np.cumsum(weights[order]) - weights[order] / 2
     median = float(np.interp(weights.sum() / 2, below, ratios[order]))
@@ -131,7 +134,8 @@ def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> N
             f"{output}: the bench file's paths are relative to it; write the copy beside"
             f" {file.path}"
         )
-    key, flux_at_white_e_per_s = "flux_at_white_e_per_s", found.flux_at_white_e_per_s
+    key = "flux_at_white_e_per_s"
+    flux_at_white_e_per_s = found.flux_at_white_e_per_s
     text = with_key(
         file.text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",)
     )

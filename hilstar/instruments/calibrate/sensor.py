@@ -214,13 +214,17 @@ def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
     # What is in electrons comes first: in DN it is rounded more coarsely.
     for reading in sorted(readings, key=lambda reading: reading.in_dn):
         key = reading.quantity.key
-        value = reading.value * gains[0].value if reading.in_dn else reading.value
+        if reading.in_dn:
+            value = reading.value * gains[0].value
+        else:
+            value = reading.value
         if key not in keys:
             keys[key], first[key] = value, reading
             continue
-        rounded = (
-            ROUNDED_ALIKE if reading.in_dn or reading.quantity is not first[key].quantity else 0.0
-        )
+        if reading.in_dn or reading.quantity is not first[key].quantity:
+            rounded = ROUNDED_ALIKE
+        else:
+            rounded = 0.0
         if abs(value - keys[key]) > rounded * abs(keys[key]):
             other = f"{first[key].place.rpartition(':')[2]} has {first[key].name} for {keys[key]:g}"
             raise InputError(
@@ -256,10 +260,9 @@ def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
                 f"{path}: {shortened(str(error))}; write a list of objects with quantity, value,"
                 " unit"
             ) from error
-        rows = [
-            (number, [str(row.get(name, "")) for name in columns])
-            for number, row in enumerate(table, start=1)
-        ]
+        rows = []
+        for number, row in enumerate(table, start=1):
+            rows.append((number, [str(row.get(name, "")) for name in columns]))
     else:
         rows = [
             (line, cells[:3])
@@ -317,7 +320,9 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
         raise InputError(
             f"{what}: {len(paths)} frames; give two of each exposure, one after the other"
         )
-    rows, largest_dn, shape = [], 0.0, read_image(paths[0], advice=FRAME_ADVICE).shape
+    rows = []
+    largest_dn = 0.0
+    shape = read_image(paths[0], advice=FRAME_ADVICE).shape
     for first, second in zip(paths[::2], paths[1::2], strict=True):
         (a, seconds), (b, again) = _exposed(first), _exposed(second)
         if not (
@@ -367,27 +372,28 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     Errors are those of a finite number of pixels. Light that is not even over the sensor counts as
     PRNU.
     """
-    light, dark = read_levels(flats, "FLATS"), read_levels(darks, "--darks")
+    light = read_levels(flats, "FLATS")
+    dark = read_levels(darks, "--darks")
     if light.shape != dark.shape:
         raise InputError("--darks: not of the flats' size; give frames of one sensor")
     _refuse_unlike_darks(dark)
-    pixels, flat_s = math.prod(dark.shape), np.nan_to_num(light.exposure_s)
+    pixels = math.prod(dark.shape)
+    flat_s = np.nan_to_num(light.exposure_s)
     noise_dn = np.sqrt(dark.temporal_dn2 / 2 + np.maximum(dark.spatial_dn2, 0.0))
     mean, mean_error = dark.line("mean_dn", 1, noise_dn)
     temporal, temporal_error = dark.line("temporal_dn2", 1, math.sqrt(2) * dark.temporal_dn2)
     spatial, spatial_error = dark.line("spatial_dn2", 2, dark.pattern_error_dn2)
-    signal, variance = (
-        light.mean_dn - np.polyval(mean, flat_s),
-        light.temporal_dn2 - np.polyval(temporal, flat_s),
-    )
+    signal = light.mean_dn - np.polyval(mean, flat_s)
+    variance = light.temporal_dn2 - np.polyval(temporal, flat_s)
     top = int(light.temporal_dn2.argmax())
     usable = np.flatnonzero(
         (signal > 0) & (light.temporal_dn2 > 0) & (signal <= LINEAR_SHARE * signal[top])
     )
     weight = pixels / 2 * (signal[usable] / light.temporal_dn2[usable]) ** 2
-    k_dn_per_e = (
-        float((variance[usable] / signal[usable]) @ weight / weight.sum()) if len(usable) else 0.0
-    )
+    if len(usable):
+        k_dn_per_e = float((variance[usable] / signal[usable]) @ weight / weight.sum())
+    else:
+        k_dn_per_e = 0.0
     if not k_dn_per_e > 0:
         raise InputError(
             "FLATS: no noise that grows with light; give raw frames of one sensor from dark to"
@@ -442,14 +448,10 @@ def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
     files. Raises InputError.
     """
     settings = sensor.settings
-    curve, chart = (
-        output.with_name(f"{output.stem}_qe.csv"),
-        output.with_name(f"{output.stem}_curves"),
-    )
-    lines, many = (
-        [f"# {source}", *(f"# {note}" for note in sensor.notes)],
-        len(sensor.efficiency) > 1,
-    )
+    curve = output.with_name(f"{output.stem}_qe.csv")
+    chart = output.with_name(f"{output.stem}_curves")
+    lines = [f"# {source}", *(f"# {note}" for note in sensor.notes)]
+    many = len(sensor.efficiency) > 1
     if sensor.efficiency:
         lines += [
             "[tracker]",
@@ -473,7 +475,8 @@ def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> N
     """Variance over signal, and dark signal over exposure, as the standard plots them: the
     file's lines, measured points.
     """
-    gain, measured = settings.gain_e_per_dn, sensor.transfer is not None and sensor.dark is not None
+    gain = settings.gain_e_per_dn
+    measured = sensor.transfer is not None and sensor.dark is not None
     finding = (
         f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at"
         f" {settings.full_well_e:.0f} e-"

@@ -17,7 +17,10 @@ def stays_until_key(window: "Window", presenter: Presenter, seconds: float | Non
     """Present until space is pressed or `seconds` are over; False if q was pressed. Raises
     MachineError without the display.
     """
-    end_s = math.inf if seconds is None else time.monotonic() + seconds
+    if seconds is None:
+        end_s = math.inf
+    else:
+        end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
         presenter.present()
         window.swap()

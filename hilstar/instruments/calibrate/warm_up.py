@@ -134,7 +134,8 @@ class _Law:
     def is_refused(self) -> bool:
         if self.at_end:
             return True
-        steps, n = np.diff(self.residual), len(self.residual)
+        steps = np.diff(self.residual)
+        n = len(self.residual)
         scatter = MAD_TO_SIGMA * float(np.median(np.abs(steps)))
         ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (
             float(self.residual @ self.residual) / self.dof + FLOOR**2
@@ -181,7 +182,8 @@ class _Law:
         if not rest:
             slope = a / (w + a * span_s)
             return np.array([slope, slope * AHEAD_S, 0.0])
-        falls, ends = -math.expm1(-AHEAD_S / rest[0]), a * math.exp(-span_s / rest[0])
+        falls = -math.expm1(-AHEAD_S / rest[0])
+        ends = a * math.exp(-span_s / rest[0])
         white = w + ends
         stable_s = rest[0] * math.log(max(abs(a) * falls / white, 1e-300) / limit)
         return np.array([-ends / white / rest[0], -ends / white * falls, stable_s])
@@ -238,28 +240,37 @@ def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> 
             (law for law in _laws(t_s[first:], light[first:]) if not law.is_refused),
             key=lambda law: law.criterion,
         )
-        found = [
+        judgements = [
             _judged(law, t_s[first:], light[first:], limit)
             for law in laws
             if law.criterion < laws[0].criterion + LIKELY
         ]
-        if found:  # white is stable only if it is by each law that is likely
-            return replace(found[0], is_stable=all(each.is_stable for each in found))
+        if judgements:  # white is stable only if it is by each law that is likely
+            return replace(
+                judgements[0], is_stable=all(judgement.is_stable for judgement in judgements)
+            )
     return WarmUp("none", False, limit)
 
 
 def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> WarmUp:
     """The figures of a law of readings (n,) at `t_s` (n,)."""
-    span_s, half = float(t_s[-1] - t_s[0]), len(t_s) // 2
+    span_s = float(t_s[-1] - t_s[0])
+    half = len(t_s) // 2
     # An exponential that has died away says nothing of the drift: a line through the last half of
     # the readings does.
-    end = _line(t_s[half:], light[half:]) if law.died_away(float(t_s[half] - t_s[0])) else law
+    if law.died_away(float(t_s[half] - t_s[0])):
+        end = _line(t_s[half:], light[half:])
+    else:
+        end = law
     (_, _, stable_s), (_, _, stable_error_s) = law.foretold(span_s, limit)
     (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(
         span_s if end is law else 0.0, limit
     )
     linear = len(law.parameters) == 2
-    stable_s = (0.0 if abs(ahead) < limit else math.inf) if linear else max(stable_s, 0.0)
+    if linear:
+        stable_s = 0.0 if abs(ahead) < limit else math.inf
+    else:
+        stable_s = max(stable_s, 0.0)
     return WarmUp(
         law="line" if linear else "exponential",
         is_stable=bool(abs(ahead) + stdtrit(end.dof, CONFIDENCE) * ahead_error < limit),
@@ -281,7 +292,8 @@ def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArra
     """White (n,) by the law that was found in these readings (n,), in their unit, for a chart;
     nan before `from_s`.
     """
-    drawn, used = np.full(len(t_s), np.nan), t_s >= found.from_s
+    drawn = np.full(len(t_s), np.nan)
+    used = t_s >= found.from_s
     if found.law != "none":
         law = _laws(t_s[used], light[used])[found.law == "exponential"]
         drawn[used] = light[used] - float(np.median(light[used])) * law.residual
@@ -290,7 +302,8 @@ def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArra
 
 def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
     """The line and the exponential that fit readings (n,) best."""
-    time, value = t_s - t_s[0], light / np.median(light)
+    time = t_s - t_s[0]
+    value = light / np.median(light)
 
     def misfit(log_tau: float) -> float:
         residual = _law(time, value, math.exp(log_tau)).residual
@@ -299,7 +312,7 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
     tried = np.linspace(
         math.log(float(np.median(np.diff(time)))), math.log(MAX_TAU * float(time[-1])), TAUS
     )
-    best = int(np.argmin([misfit(each) for each in tried]))
+    best = int(np.argmin([misfit(tau_s) for tau_s in tried]))
     bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
     log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
     margin = END_SHARE * (tried[1] - tried[0])
@@ -315,16 +328,17 @@ def _law(time: FloatArray, value: FloatArray, tau: float | None = None) -> _Law:
     """Least squares at times (n,) from 0 on: a line, or an exponential of a time constant."""
     shape = time if tau is None else np.exp(-time / tau)
     columns = np.stack([np.ones_like(time), shape], axis=1)
-    found = np.linalg.lstsq(columns, value, rcond=None)[0]
-    residual = value - columns @ found
+    coefficients = np.linalg.lstsq(columns, value, rcond=None)[0]
+    residual = value - columns @ coefficients
     if tau is not None:
-        columns = np.column_stack([columns, found[1] * shape * time / tau**2])
-        found = np.append(found, tau)
-    dof, size = len(value) - columns.shape[1], np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        columns = np.column_stack([columns, coefficients[1] * shape * time / tau**2])
+        coefficients = np.append(coefficients, tau)
+    dof = len(value) - columns.shape[1]
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     scaled = columns / size
     noise2 = float(residual @ residual) / dof + FLOOR**2
     return _Law(
-        found,
+        coefficients,
         noise2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-13) / np.outer(size, size),
         residual,
         dof,

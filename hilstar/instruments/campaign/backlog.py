@@ -37,7 +37,8 @@ class Backlog:
     """
 
     def __init__(self, design: Design, journal: Journal, target_s: float) -> None:
-        self._design, self._target_s = design, target_s
+        self._design = design
+        self._target_s = target_s
         self._waiting: deque[Task] = deque()
         self._runs = self._missing_runs(journal)
         self._left: tuple[int, int] | None = None

@@ -20,7 +20,8 @@ def bench_summary(table: Path) -> dict[str, Any]:
     --json`. Raises InputError.
     """
     cases = read_cases(table)
-    numbers, some = cases.numbers, np.flatnonzero(np.nan_to_num(cases.numbers["wrong"]) > 0)
+    numbers = cases.numbers
+    some = np.flatnonzero(np.nan_to_num(cases.numbers["wrong"]) > 0)
     wrong = [
         (
             int(numbers["case"][k]),
@@ -43,24 +44,28 @@ def bench_summary(table: Path) -> dict[str, Any]:
 
 def bench_lines(summary: dict[str, Any]) -> list[str]:
     """The same on the terminal."""
-    lines = [f"{summary['no_answer']} cases without an answer"] if summary["no_answer"] else []
-    wrong, drift = summary["wrong_cases"], summary["drift"]
+    if summary["no_answer"]:
+        lines = [f"{summary['no_answer']} cases without an answer"]
+    else:
+        lines = []
+    wrong = summary["wrong_cases"]
+    drift = summary["drift"]
     if wrong:
         named = ", ".join(
-            f"case {each['case']} by {each['off_deg']:.3g} deg" for each in wrong[:MAX_NAMED]
+            f"case {case['case']} by {case['off_deg']:.3g} deg" for case in wrong[:MAX_NAMED]
         )
         lines.append(
             f"wrong answers in {len(wrong)} cases:"
             f" {named}{', ...' if len(wrong) > MAX_NAMED else ''}"
         )
     if drift is not None:
-        parts = [
-            f"{value:.3g}{_sigma(sigma)}"
-            for value, sigma in zip(drift["arcsec"], drift["sigma_arcsec"], strict=True)
-        ]
-        mag = (
-            "" if drift["mag"] is None else f", {drift['mag']:.3g}{_sigma(drift['sigma_mag'])} mag"
-        )
+        parts = []
+        for value, sigma in zip(drift["arcsec"], drift["sigma_arcsec"], strict=True):
+            parts.append(f"{value:.3g}{_sigma(sigma)}")
+        if drift["mag"] is None:
+            mag = ""
+        else:
+            mag = f", {drift['mag']:.3g}{_sigma(drift['sigma_mag'])} mag"
         lines.append(
             f"{'drift of the bench':20}{', '.join(parts)} arcsec about x, y, z{mag}, by"
             f" {drift['checks']} check cases"

@@ -89,14 +89,19 @@ class BenchOrder:
     """
 
     def __init__(self, plan: Plan, cases: int, maker: CaseMaker, design: Design) -> None:
-        self.plan, self.maker, self.cases = plan, maker, cases
-        self._design, self._every = design, plan.check_every
+        self.plan = plan
+        self.maker = maker
+        self.cases = cases
+        self._design = design
+        self._every = plan.check_every
         self._keys = [
             key
-            for key in (each.key for each in maker.parameters)
+            for key in (parameter.key for parameter in maker.parameters)
             if key.split(".")[0] in ("sky", "render", "spacecraft")
         ]
-        self._keys += [SCENARIO] if any(each.key == SCENARIO for each in maker.parameters) else []
+        self._keys += (
+            [SCENARIO] if any(parameter.key == SCENARIO for parameter in maker.parameters) else []
+        )
         order = np.random.default_rng((plan.seed, ORDER_STREAM)).permutation(cases)
         if self._keys:
             group: dict[str, int] = {}
@@ -110,7 +115,9 @@ class BenchOrder:
     @property
     def checks(self) -> int:
         """How many check cases there are."""
-        return -(-self.cases // self._every) + 1 if self._every else 0
+        if self._every:
+            return -(-self.cases // self._every) + 1
+        return 0
 
     def case(self, number: int) -> Case:
         """The case of a number; a check case is the attitude of case 0, at rest."""
@@ -128,11 +135,9 @@ class BenchOrder:
         renderer.
         """
         values = self.case(number).values
-        return (
-            msgspec.json.encode([values.get(key) for key in self._keys]).decode()
-            if self._keys
-            else ""
-        )
+        if self._keys:
+            return msgspec.json.encode([values.get(key) for key in self._keys]).decode()
+        return ""
 
     def turns(self) -> Iterator[tuple[str, int, int]]:
         """Renderer, number and place in the order of each case, check cases among them with the
@@ -210,16 +215,21 @@ class BenchRun:
         on_done: Callable[[int], None],
     ) -> None:
         self.journal: Journal = directory.journal(order.cases + order.checks)
-        self._order, self._plan, self._maker, self._columns = (
-            order,
-            order.plan,
-            order.maker,
-            columns,
-        )
-        self._source, self._rules, self._notices, self._on_done = source, rules, notices, on_done
+        self._order = order
+        self._plan = order.plan
+        self._maker = order.maker
+        self._columns = columns
+        self._source = source
+        self._rules = rules
+        self._notices = notices
+        self._on_done = on_done
         self._done = self.journal.done
-        self._now_path, runs = directory.path / NOW, directory.path / RUNS
-        begun = runs.read_text().splitlines()[1:] if runs.exists() else []
+        self._now_path = directory.path / NOW
+        runs = directory.path / RUNS
+        if runs.exists():
+            begun = runs.read_text().splitlines()[1:]
+        else:
+            begun = []
         self._run = len(begun) + 1
         starts: list[list[Any]] = [
             *(line.split(",") for line in begun),
@@ -268,18 +278,20 @@ class BenchRun:
         """Show cases (number, place) that have one renderer; whether all of them are over, and
         no signal ended the run.
         """
-        bench, screen = opened.bench, opened.screen
+        bench = opened.bench
+        screen = opened.screen
         period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         if self._frames is None:
             self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
             self._judge = AnswerJudge(self._rules, self._frames)
         self._base = self._next
-        self._light_ns, self._file_sha256 = (
-            0 if screen is None else screen.swap_to_light_ns,
-            bench.file.sha256,
-        )
+        self._light_ns = 0 if screen is None else screen.swap_to_light_ns
+        self._file_sha256 = bench.file.sha256
         self._last_row_ns = 0 if screen is None else round(bench.scan.scanout_s / 2 * NS_PER_S)
-        pacer = Pacer(period_ns) if screen is None else DisplayPacer(screen, self._notices)
+        if screen is None:
+            pacer = Pacer(period_ns)
+        else:
+            pacer = DisplayPacer(screen, self._notices)
         faults = self._faults(bench, turns)
 
         def sink(shown: Shown) -> None:
@@ -288,7 +300,8 @@ class BenchRun:
 
         loop = FrameLoop(bench, sink, pacer, None, self._notices, faults)
         opened.follower(Running(loop, PacketCounts()))
-        self._turns, over = list(reversed(turns)), False
+        self._turns = list(reversed(turns))
+        over = False
 
         def draw_slot(moment: Moment) -> Shown | None:
             nonlocal over
@@ -333,17 +346,18 @@ class BenchRun:
 
         def on(t_ns: int) -> tuple[FaultNow, ...]:
             is_case = self._now is not None and self._now.case.number < self._order.cases
-            return timetable.on(t_ns - self._maker.begin_ns) if is_case else ()
+            if is_case:
+                return timetable.on(t_ns - self._maker.begin_ns)
+            return ()
 
         return FaultyFrames(on, view)
 
     def _begin(self, number: int, place: int) -> None:
         case = self._order.case(number)
-        end_s = (
-            self._maker.fault_end_s(case, self._plan.limit_s)
-            if number < self._order.cases
-            else None
-        )
+        if number < self._order.cases:
+            end_s = self._maker.fault_end_s(case, self._plan.limit_s)
+        else:
+            end_s = None
         self._now = Tally(case, place, fault_end_s=end_s)
         self._waiting = False
 
@@ -352,12 +366,13 @@ class BenchRun:
         now = self._now
         if now is None:
             return None
-        elapsed_ns = 0 if now.begun_ns is None else max(light_ns - now.begun_ns, 0)
-        return (
-            now.case.first
-            if now.case.number >= self._order.cases
-            else self._maker.after(now.case, elapsed_ns, self._rules.exposure_s)
-        )
+        if now.begun_ns is None:
+            elapsed_ns = 0
+        else:
+            elapsed_ns = max(light_ns - now.begun_ns, 0)
+        if now.case.number >= self._order.cases:
+            return now.case.first
+        return self._maker.after(now.case, elapsed_ns, self._rules.exposure_s)
 
     def _lit(self, shown: Shown) -> None:
         """Take a frame that was shown."""
@@ -402,7 +417,8 @@ class BenchRun:
         refused = sum(self._source.refusals().values())
         answers = self._source.take()
         if answers or refused != self._refused:
-            self._heard_ns, self._refused = now_ns, refused
+            self._heard_ns = now_ns
+            self._refused = refused
             # the tracker is back: its case begins again
             if self._waiting and self._now is not None:
                 self._notices.tell(
@@ -412,7 +428,8 @@ class BenchRun:
                 self._begin(self._now.case.number, self._now.place)
         for answer in answers:
             self._count(self._judge.judge(answer), answer)
-        now, plan = self._now, self._plan
+        now = self._now
+        plan = self._plan
         if now is None or now.begun_ns is None:
             return
         if now.received < plan.asked:
@@ -428,27 +445,33 @@ class BenchRun:
                 self._waiting = True
                 return
         self._keep(self._row(now))
-        self._before_q, self._now, self._waiting = self._shown_q, None, False
+        self._before_q = self._shown_q
+        self._now = None
+        self._waiting = False
         self._dark_until_ns = now_ns + round(plan.blank_s * NS_PER_S)
 
     def _count(self, judged: Judged, answer: Answer) -> None:
         """Count an answer for the case on the display, if it is of that case."""
-        now, plan = self._now, self._plan
+        now = self._now
+        plan = self._plan
         if now is None or now.begun_ns is None or not self._is_of(now, judged, answer):
             return
-        off = None if judged.residual is None else float(np.linalg.norm(judged.residual))
+        if judged.residual is None:
+            off = None
+        else:
+            off = float(np.linalg.norm(judged.residual))
         right = off is not None and off <= plan.wrong_above_arcsec
         after_s = (answer.host_ns - now.begun_ns) / NS_PER_S
         if right:
             now.first_attitude_s = after_s if now.first_attitude_s is None else now.first_attitude_s
-            fault_end_s, seen_s = now.fault_end_s, (judged.middle_ns - now.begun_ns) / NS_PER_S
+            fault_end_s = now.fault_end_s
+            seen_s = (judged.middle_ns - now.begun_ns) / NS_PER_S
             if fault_end_s is not None and now.recovery_s is None and seen_s >= fault_end_s:
                 now.recovery_s = after_s - fault_end_s
-        settled = (
-            now.received > 0 or off is not None
-            if plan.settle_s is None
-            else after_s >= plan.settle_s
-        )
+        if plan.settle_s is None:
+            settled = now.received > 0 or off is not None
+        else:
+            settled = after_s >= plan.settle_s
         if settled and now.received < plan.asked:
             now.take(judged, right)
 
@@ -522,11 +545,16 @@ class BenchRun:
 
 def write_checks(path: Path, rows: list[Row], cases: int) -> None:
     """Write the check cases' rows as checks.csv."""
-    told = [(row["case"] - cases, row["begun_utc"], row["run"], row["received"]) for row in rows]
+    check_rows = [
+        (row["case"] - cases, row["begun_utc"], row["run"], row["received"]) for row in rows
+    ]
     write_csv(
         path,
         CHECK_COLUMNS,
-        [[*told[k], *(row[name] for name in CHECK_COLUMNS[4:])] for k, row in enumerate(rows)],
+        [
+            [*check_rows[k], *(row[name] for name in CHECK_COLUMNS[4:])]
+            for k, row in enumerate(rows)
+        ],
     )
 
 
@@ -540,17 +568,16 @@ def drift_of(path: Path) -> dict[str, Any] | None:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     at_s = np.array([datetime.fromisoformat(row["begun_utc"]).timestamp() for row in rows])
-    found = {
-        name: _line(at_s, [float(row[name]) if row[name] else None for row in rows])
-        for name in CHECK_COLUMNS[4:]
-    }
-    each = [line for axis in AXES if (line := found[f"error_{axis}_arcsec"]) is not None]
-    if len(each) < len(AXES):
+    lines = {}
+    for name in CHECK_COLUMNS[4:]:
+        lines[name] = _line(at_s, [float(row[name]) if row[name] else None for row in rows])
+    axis_lines = [line for axis in AXES if (line := lines[f"error_{axis}_arcsec"]) is not None]
+    if len(axis_lines) < len(AXES):
         return None
-    mag = found["signal_mag"] or (None, None)
+    mag = lines["signal_mag"] or (None, None)
     arcsec = {
-        "arcsec": [change for change, _ in each],
-        "sigma_arcsec": [sigma for _, sigma in each],
+        "arcsec": [change for change, _ in axis_lines],
+        "sigma_arcsec": [sigma for _, sigma in axis_lines],
     }
     return {"checks": len(rows), **arcsec, "mag": mag[0], "sigma_mag": mag[1]}
 
@@ -562,14 +589,16 @@ def _line(at_s: FloatArray, values: list[float | None]) -> tuple[float, float | 
     known = np.array([value is not None for value in values])
     if known.sum() < 2:
         return None
-    t, y = (
-        at_s[known] - at_s[known].mean(),
-        np.array([value for value in values if value is not None]),
-    )
-    span, power = float(np.ptp(at_s)), float(t @ t)
+    t = at_s[known] - at_s[known].mean()
+    y = np.array([value for value in values if value is not None])
+    span = float(np.ptp(at_s))
+    power = float(t @ t)
     if not power:
         return None
     slope = float(t @ y) / power
-    left = y - y.mean() - slope * t
-    sigma = math.sqrt(float(left @ left) / (len(y) - 2) / power) * span if len(y) > 2 else None
+    residual = y - y.mean() - slope * t
+    if len(y) > 2:
+        sigma = math.sqrt(float(residual @ residual) / (len(y) - 2) / power) * span
+    else:
+        sigma = None
     return slope * span, sigma

@@ -131,7 +131,8 @@ class CaseMaker:
     """
 
     def __init__(self, plan: Plan, file: BenchFile, folder: Path) -> None:
-        self.plan, self.file = plan, file
+        self.plan = plan
+        self.file = file
         self._tables = parse_toml(file.path, file.text)
         self._log = (
             None if plan.attitudes.log is None else _read_log(folder / plan.attitudes.log, file)
@@ -156,11 +157,11 @@ class CaseMaker:
 
     def case(self, number: int, point: FloatArray) -> Case:
         """The case of this number at a point (dimensions,) of the design."""
-        look, rest = point[: self.attitude_dimensions], point[self.attitude_dimensions :]
-        values = {
-            parameter.key: parameter.value(float(u))
-            for parameter, u in zip(self.parameters, rest, strict=True)
-        }
+        look = point[: self.attitude_dimensions]
+        rest = point[self.attitude_dimensions :]
+        values = {}
+        for parameter, u in zip(self.parameters, rest, strict=True):
+            values[parameter.key] = parameter.value(float(u))
         seed = values.get("noise_seed")
         if seed is None:
             state = np.random.SeedSequence((self.plan.seed, number)).generate_state(1, np.uint64)
@@ -175,7 +176,9 @@ class CaseMaker:
         if self._log is not None:
             file = dated(file, self._log.scale, self._log.span_ns[0])
         turn_arcsec = [float(case.values.get(f"misalignment_arcsec.{axis}", 0.0)) for axis in "xyz"]
-        return _misaligned(file, np.array(turn_arcsec)) if any(turn_arcsec) else file
+        if any(turn_arcsec):
+            return _misaligned(file, np.array(turn_arcsec))
+        return file
 
     def view(self, case: Case, frame: int, exposure_s: float) -> View:
         """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along
@@ -192,11 +195,10 @@ class CaseMaker:
             if not any(key.startswith("rate_deg_s.") for key in case.values):
                 return along
             return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
-        q = (
-            propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S)
-            if step_ns
-            else first.q_icrs_to_cam
-        )
+        if step_ns:
+            q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S)
+        else:
+            q = first.q_icrs_to_cam
         return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
@@ -204,11 +206,9 @@ class CaseMaker:
         since its beginning.
         """
         scenario = self.scenario(case)
-        return (
-            None
-            if scenario is None
-            else faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
-        )
+        if scenario is None:
+            return None
+        return faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
 
     @property
     def begin_ns(self) -> int:
@@ -347,7 +347,11 @@ def bench_columns(parameters: list[Parameter]) -> dict[str, Kind]:
 
 def columns_kind(name: str) -> Kind:
     """The kind of a column that is not varied."""
-    return "text" if name in TEXTS else "int64" if name in WHOLE else "float64"
+    if name in TEXTS:
+        return "text"
+    if name in WHOLE:
+        return "int64"
+    return "float64"
 
 
 def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind]:
@@ -481,16 +485,18 @@ class CaseTally:
         if self.first_q is not None:
             row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
         row |= spread_row(self.errors_arcsec)
-        return row | self._centroids() if self.with_centroids and self.star_errors else row
+        if self.with_centroids and self.star_errors:
+            return row | self._centroids()
+        return row
 
     def _centroids(self) -> Row:
         dx_px, dy_px = (
-            np.concatenate([getattr(seen, name) for seen in self.star_errors])
+            np.concatenate([getattr(star_errors, name) for star_errors in self.star_errors])
             for name in ("dx_px", "dy_px")
         )
-        v_mag = np.concatenate([seen.v_mag for seen in self.star_errors])
+        v_mag = np.concatenate([star_errors.v_mag for star_errors in self.star_errors])
         row: Row = {
-            name: sum(getattr(seen, name) for seen in self.star_errors)
+            name: sum(getattr(star_errors, name) for star_errors in self.star_errors)
             for name in ("stars", "found", "matched", "false")
         }
         row["measured"] = len(dx_px)

@@ -175,11 +175,15 @@ class Cluster(Closing):
         except ImportError as error:
             raise MachineError(f"--scheduler needs Dask's distributed; {INSTALL}") from error
         address = scheduler.check()
-        self._address, self._job, self._identity, self._say = address, job, identity, say
+        self._address = address
+        self._job = job
+        self._identity = identity
+        self._say = say
         self._workers: dict[str, _Worker] = {}
         self._examined: dict[Any, str] = {}
         self._alone_since_s: float | None = None
-        self._looked_s, self._answered_s = 0.0, time.monotonic()
+        self._looked_s = 0.0
+        self._answered_s = time.monotonic()
         self._something = threading.Event()  # a future is done
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it logs each worker that goes
         security = scheduler.security()
@@ -308,8 +312,11 @@ class Cluster(Closing):
                 continue
             worker.checked = True
             try:
-                said = future.result(timeout=FETCH_S)
-                why = difference(said, self._identity) if isinstance(said, Identity) else str(said)
+                identity = future.result(timeout=FETCH_S)
+                if isinstance(identity, Identity):
+                    why = difference(identity, self._identity)
+                else:
+                    why = str(identity)
             except Exception as error:  # an older hilstar without campaigns, or none at all
                 # worker or scheduler is gone; a worker that is still there is asked again
                 if future.status != "error":
@@ -354,7 +361,10 @@ class Cluster(Closing):
             self._alone_since_s = None
             return
         now_s = time.monotonic()
-        refused = f"; {len(self._workers)} are refused" if self._workers else ""
+        if self._workers:
+            refused = f"; {len(self._workers)} are refused"
+        else:
+            refused = ""
         advice = (
             f"start some: dask worker {self._address} --nthreads 1 --nworkers 8"
             f" {self._dask_words()}"

@@ -44,7 +44,8 @@ class DisplayTracker:
     """
 
     def __init__(self, file: BenchFile) -> None:
-        self.file, self.config = file, file.config
+        self.file = file
+        self.config = file.config
         self._bench = open_bench(file)
         self._load()
         self._load_optics()
@@ -58,7 +59,10 @@ class DisplayTracker:
         """Switch to another bench file of the same folder, rebuilding only what changed."""
         if file.config == self.config:
             return
-        before, psf, self.file, self.config = self.config, self.canvas.psf, file, file.config
+        before = self.config
+        psf = self.canvas.psf
+        self.file = file
+        self.config = file.config
         if _shown_keys(before) != _shown_keys(self.config) or self._bench.moving is not None:
             self._bench.close()
             self._bench = open_bench(file)
@@ -99,11 +103,13 @@ class DisplayTracker:
         """One exposure of the display, without noise if there is no generator. Raises InputError
         as the detector does.
         """
-        exposure_s, view = view.exposure_s, rolled(view, self.config.tracker)
+        exposure_s = view.exposure_s
+        view = rolled(view, self.config.tracker)
         if view.scan.scanout_s and exposure_s:
             shown, glow_e_per_s = self._rolling_e_per_s(view, rng)
         else:
-            shown, glow_e_per_s = self._light_e_per_s(view), self._glow_e_per_s
+            shown = self._light_e_per_s(view)
+            glow_e_per_s = self._glow_e_per_s
         shown_e_per_s = self._colours.shown(self._optics.images_e_per_s(shown, self._primaries))
         glow_e = self._colours.grey(glow_e_per_s) * exposure_s
         mean_e = shown_e_per_s * exposure_s + glow_e + self._background.of_view_e(view)
@@ -126,10 +132,8 @@ class DisplayTracker:
 
     def _light_e_per_s(self, view: View) -> FloatArray:
         """The mean light (primaries, H, W) of the display over the exposure."""
-        count, moving = (
-            max(1, round(view.exposure_s * self.config.monitor.refresh_hz)),
-            self._bench.moving,
-        )
+        count = max(1, round(view.exposure_s * self.config.monitor.refresh_hz))
+        moving = self._bench.moving
         streaks = moving is not None and moving.satellites is not None
         if not streaks and not view.turn.rate_cam_rad_s.any():
             count = len(self._bench.quantiser.exposure(0, count))
@@ -144,7 +148,9 @@ class DisplayTracker:
                 primary_lights(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel)
             )
             total = light if total is None else total + light
-        return np.zeros((0, 0, 0)) if total is None else total / count
+        if total is None:
+            return np.zeros((0, 0, 0))
+        return total / count
 
     def _rolling_e_per_s(
         self, view: View, rng: np.random.Generator | None
@@ -152,11 +158,12 @@ class DisplayTracker:
         """The mean light (primaries, H, W) of the display over each place's own exposure, and
         that of the glow (h, w).
         """
-        period_s, free = (
-            1 / self.config.monitor.refresh_hz,
-            self.config.tracker.trigger == "free" and rng is not None,
-        )
-        phase_s = rng.uniform(0, period_s) if free and rng is not None else -view.exposure_s / 2
+        period_s = 1 / self.config.monitor.refresh_hz
+        free = self.config.tracker.trigger == "free" and rng is not None
+        if free and rng is not None:
+            phase_s = rng.uniform(0, period_s)
+        else:
+            phase_s = -view.exposure_s / 2
         light, glow = rolling_light(self._bench, self._optics.geometry, self._panel, view, phase_s)
         return light, self._glow_e_per_s * glow
 
@@ -177,10 +184,8 @@ def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
         tracker.transmission,
         tracker.exposure_s,
     )
-    open_part, drawn = (
-        tracker.detector.fill_factor,
-        None if config.render.psf == GAUSSIAN else _optics_keys(config),
-    )
+    open_part = tracker.detector.fill_factor
+    drawn = None if config.render.psf == GAUSSIAN else _optics_keys(config)
     return (
         config.sky,
         config.spacecraft,

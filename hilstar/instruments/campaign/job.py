@@ -42,9 +42,9 @@ class Identity(msgspec.Struct, frozen=True):
 
 def difference(found: Identity, wanted: Identity) -> str | None:
     """The first difference of a worker's identity, in words; None where there is none."""
-    for name, words in WORDS.items():
+    for name, name_text in WORDS.items():
         if getattr(found, name) != getattr(wanted, name):
-            return "has " + words.format(getattr(found, name), getattr(wanted, name))
+            return "has " + name_text.format(getattr(found, name), getattr(wanted, name))
     return None
 
 
@@ -86,7 +86,8 @@ def peak_bytes() -> int:
 def code_sha256() -> str:
     """The digest of hilstar's code: its Python files and its shaders."""
     digest = hashlib.sha256()
-    package, shaders = Path(hilstar.__file__).parent, resource_path("shaders", "star.vert").parent
+    package = Path(hilstar.__file__).parent
+    shaders = resource_path("shaders", "star.vert").parent
     for root, pattern in ((package, "*.py"), (shaders, "*")):
         for path in sorted(root.rglob(pattern)):
             if path.is_file():
@@ -115,8 +116,11 @@ def files_sha256(plan: Plan, folder: Path) -> str:
         for name in each.values or ()
         if name
     ]
-    told = [] if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN) else [plan.centroids.psf]
-    for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied, *told]:
+    if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN):
+        psf_files = []
+    else:
+        psf_files = [plan.centroids.psf]
+    for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied, *psf_files]:
         with open_regular(folder / name, "give the path of a file") as file:
             while chunk := file.read(CHUNK_BYTES):
                 digest.update(chunk)

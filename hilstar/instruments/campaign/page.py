@@ -51,7 +51,8 @@ def write_campaign_page(
 
 def verdict_of(summary: Mapping[str, Any]) -> Verdict:
     """BAD with wrong answers, WARN where cases failed or an answer is missing, else OK."""
-    wrong, failed = summary["wrong"], summary["failed"]
+    wrong = summary["wrong"]
+    failed = summary["failed"]
     headline = f"The tracker was right in {_percent(summary['availability'])} of the frames"
     counts = f"{summary['cases']} cases, {failed} failed, {wrong} wrong answers."
     if wrong:

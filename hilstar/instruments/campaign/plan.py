@@ -149,7 +149,10 @@ class Require(Table, frozen=True):
     @property
     def limit(self) -> float:
         """The limit, of either kind."""
-        limit = self.maximum if self.minimum is None else self.minimum
+        if self.minimum is None:
+            limit = self.maximum
+        else:
+            limit = self.minimum
         return 0.0 if limit is None else limit
 
     @property
@@ -161,8 +164,14 @@ class Require(Table, frozen=True):
     def words(self) -> str:
         """The requirement in words: quantity, axis, limit, share and condition."""
         axis = f" {self.axis or 'cross'}" if self.of_axis else ""
-        share = f" in {100 * self.share:g} % of cases" if self.share else ""
-        where = f" where {self.condition}" if self.condition else ""
+        if self.share:
+            share = f" in {100 * self.share:g} % of cases"
+        else:
+            share = ""
+        if self.condition:
+            where = f" where {self.condition}"
+        else:
+            where = ""
         side = "at most" if self.minimum is None else "at least"
         unit = QUANTITY_UNITS[self.quantity]
         return (
@@ -196,12 +205,16 @@ class Plan(Table, frozen=True):
     @property
     def asked(self) -> int:
         """How many answers a case on the bench gathers."""
-        return DEFAULT_ANSWERS if self.answers is None else self.answers
+        if self.answers is None:
+            return DEFAULT_ANSWERS
+        return self.answers
 
     @property
     def limit_s(self) -> float:
         """How long a case on the bench lasts at most."""
-        return DEFAULT_TIMEOUT_S if self.timeout_s is None else self.timeout_s
+        if self.timeout_s is None:
+            return DEFAULT_TIMEOUT_S
+        return self.timeout_s
 
 
 KIND = Kind(Plan, "docs/campaign.md", TYPE_WORDS)
@@ -277,8 +290,8 @@ def _check_attitudes(attitudes: Attitudes) -> None:
 
 
 def _check_told(centroids: Centroiding) -> None:
-    told = centroids.psf, centroids.psf_focus_um, centroids.psf_spectrum
-    if centroids.centroider == "window" and told != (TRACKER_PSF, 0.0, "star"):
+    told_keys = centroids.psf, centroids.psf_focus_um, centroids.psf_spectrum
+    if centroids.centroider == "window" and told_keys != (TRACKER_PSF, 0.0, "star"):
         raise InputError(
             '[centroids] psf, psf_focus_um and psf_spectrum are for centroider = "psf"; write that,'
             " or leave them out"
@@ -349,7 +362,7 @@ def conditions_of(text: str) -> list[Condition]:
     """The conditions of `condition = "KEY <= 0.5 and KEY > 0.1"`, none for an empty text. Raises
     InputError.
     """
-    found = []
+    conditions = []
     for part in text.split(" and ") if text.strip() else []:
         match = CONDITION.fullmatch(part)
         key, comparison, word, number = match.groups() if match else ("", "", None, "")
@@ -362,21 +375,21 @@ def conditions_of(text: str) -> list[Condition]:
                 f'condition = "{shortened(text)}"; write such as "rate_deg_s.across <= 0.5": a key,'
                 ' one of <= < >= > == !=, a number, and " and " between several'
             )
-        found.append(Condition(key, comparison, value))
-    return found
+        conditions.append(Condition(key, comparison, value))
+    return conditions
 
 
 def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]:
     """The conditions on columns (name -> kind) of a campaign's table, by their names there.
     Raises InputError.
     """
-    found = []
+    conditions = []
     for key, comparison, value in conditions_of(text):
         name = f"vary.{key}" if f"vary.{key}" in columns else key
         if name not in columns or isinstance(value, str) != (columns[name] == "text"):
             varied = (
                 ", ".join(
-                    each.removeprefix("vary.") for each in columns if each.startswith("vary.")
+                    column.removeprefix("vary.") for column in columns if column.startswith("vary.")
                 )
                 or "none"
             )
@@ -386,8 +399,8 @@ def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]
                 f" and no column of {'texts' if isinstance(value, str) else 'numbers'}; write one"
                 " of those"
             )
-        found.append(Condition(name, comparison, value))
-    return found
+        conditions.append(Condition(name, comparison, value))
+    return conditions
 
 
 @dataclass(frozen=True, slots=True)
@@ -413,7 +426,8 @@ class Parameter:
             else (self.minimum, self.maximum)
         )
         value = low + share * (high - low)
-        value = min(max(math.exp(value), self.minimum), self.maximum) if self.log else value
+        if self.log:
+            value = min(max(math.exp(value), self.minimum), self.maximum)
         return round(value) if self.whole else value
 
 
@@ -422,7 +436,7 @@ def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
     as the file does.
     """
     tables = parse_toml(file.path, file.text)
-    found = []
+    parameter_list = []
     for varied in plan.vary:
         parameter = _parameter(varied, file)
         ends = parameter.values or (parameter.value(0.0), parameter.value(1.0))
@@ -431,8 +445,8 @@ def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
                 _check_value(parameter, value, file, tables)
             except InputError as error:
                 raise InputError(f'[[vary]] key = "{shortened(varied.key)}": {error}') from error
-        found.append(parameter)
-    return found
+        parameter_list.append(parameter)
+    return parameter_list
 
 
 def grid_levels(plan: Plan) -> list[int]:
@@ -480,7 +494,8 @@ def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict
                 f'the value {shortened(value)}; write paths of scenario files, and "" for none'
             )
         return
-    whole, largest = parameter.key in WHOLE, MAX_OWN[parameter.key.split(".")[0]]
+    whole = parameter.key in WHOLE
+    largest = MAX_OWN[parameter.key.split(".")[0]]
     low = 0 if whole else -largest
     if (
         isinstance(value, bool)
@@ -496,7 +511,10 @@ def _now(names: list[str], config: Any) -> Any:
     """The bench file's value at dotted `names`, defaults included; None for an unknown one."""
     for name in names:
         if isinstance(config, tuple):
-            config = config[int(name)] if name.isdigit() and int(name) < len(config) else None
+            if name.isdigit() and int(name) < len(config):
+                config = config[int(name)]
+            else:
+                config = None
         elif isinstance(config, msgspec.Struct):
             config = getattr(config, name, None)
         else:
@@ -510,10 +528,16 @@ def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> N
     """
     table: Any = tables
     for name in names[:-1]:
-        inside = table.get(name) if isinstance(table, dict) else None
+        if isinstance(table, dict):
+            inside = table.get(name)
+        else:
+            inside = None
         if inside is None or not isinstance(inside, dict | list):
             present = _now(names[: names.index(name) + 1], config)
-            inside = list(present) if isinstance(present, tuple) else {}
+            if isinstance(present, tuple):
+                inside = list(present)
+            else:
+                inside = {}
             table[name] = inside
         table = inside
     last = names[-1]
@@ -546,8 +570,11 @@ class Design:
         attitude_dimensions: int,
         levels: Sequence[int],
     ) -> None:
-        self.sampling, self.seed, self.cases = sampling, seed, cases
-        self.attitude_dimensions, self.levels = attitude_dimensions, tuple(levels)
+        self.sampling = sampling
+        self.seed = seed
+        self.cases = cases
+        self.attitude_dimensions = attitude_dimensions
+        self.levels = tuple(levels)
         self.dimensions = attitude_dimensions + len(levels)
         self._cube: FloatArray | None = None
         self._engine: Sobol | None = None
@@ -581,11 +608,15 @@ class Design:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
                 return np.asarray(self._engine.random(end - begin))
-        points, own = np.empty((end - begin, self.dimensions)), self.attitude_dimensions
+        points = np.empty((end - begin, self.dimensions))
+        own_dimensions = self.attitude_dimensions
         for row, case in zip(points, range(begin, end), strict=True):
-            row[:own] = np.random.default_rng((self.seed, case, ATTITUDE_STREAM)).random(own)
-            level = (
-                np.unravel_index(case % math.prod(self.levels), self.levels) if self.levels else ()
+            row[:own_dimensions] = np.random.default_rng((self.seed, case, ATTITUDE_STREAM)).random(
+                own_dimensions
             )
-            row[own:] = (np.array(level) + 0.5) / self.levels
+            if self.levels:
+                level = np.unravel_index(case % math.prod(self.levels), self.levels)
+            else:
+                level = ()
+            row[own_dimensions:] = (np.array(level) + 0.5) / self.levels
         return points

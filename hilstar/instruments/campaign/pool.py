@@ -25,9 +25,12 @@ class Pool:
     def __init__(
         self, job: Job, identity: Identity, count: int, memory_bytes: int | None = None
     ) -> None:
-        self._identity, self._count, self._memory_bytes = identity, count, memory_bytes
+        self._identity = identity
+        self._count = count
+        self._memory_bytes = memory_bytes
         self._processes = ProcessPool(_start_session, (job,), (HilstarError,))
-        self._starts_lost, self._peak_bytes = 0, 0
+        self._starts_lost = 0
+        self._peak_bytes = 0
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
         """Run all cases. `done` gets each task with its rows, `lost` a task whose worker died, and
@@ -40,18 +43,18 @@ class Pool:
             self._start_missing(backlog)
             if all(worker.task is None and worker.ready for worker in workers):
                 return
-            for worker, news, said in self._processes.heard():
+            for worker, news, payload in self._processes.heard():
                 if news == "error":
-                    raise said
+                    raise payload
                 if news == "died":
-                    self._replace(worker, said, backlog, lost)
+                    self._replace(worker, payload, backlog, lost)
                 elif news == "ready":
-                    other = difference(said, self._identity)
+                    other = difference(payload, self._identity)
                     if other is not None:
                         raise MachineError(f"a worker of this machine {other}")
                     self._starts_lost = 0
                 else:
-                    self._take(worker, said, backlog, done)
+                    self._take(worker, payload, backlog, done)
 
     def _start_missing(self, backlog: Backlog) -> None:
         workers = self._processes.workers
@@ -83,7 +86,8 @@ class Pool:
     def _take(
         self, worker: WorkerProcess, answered: Answered, backlog: Backlog, done: Done
     ) -> None:
-        task, worker.task = worker.task, None
+        task = worker.task
+        worker.task = None
         self._peak_bytes = max(self._peak_bytes, answered.peak_bytes)
         backlog.done(task, answered.seconds)
         done(task, answered)

@@ -75,22 +75,21 @@ class RequirementVerdict:
     def words(self) -> str:
         """The verdict in a line."""
         require = self.require
-        said = f"{require.words}: {self.verdict}"
+        verdict_text = f"{require.words}: {self.verdict}"
         if self.bound is not None and self.value is not None:
-            side = (
-                "not more"
-                if (self.verdict == NOT_MET) == (require.minimum is not None)
-                else "not less"
-            )
-            said += (
+            if (self.verdict == NOT_MET) == (require.minimum is not None):
+                side = "not more"
+            else:
+                side = "not less"
+            verdict_text += (
                 f", {self.value:.4g} in {self.cases} cases, {side} than {self.bound:.4g} at"
                 f" {100 * require.confidence:g} %"
             )
         if self.verdict == NOT_SHOWN:
-            said += (
+            verdict_text += (
                 f"; about {self.more} more cases would show it" if self.more else f"; {self.method}"
             )
-        return said
+        return verdict_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +113,8 @@ class _TooFew(Exception):
 
     def __init__(self, why: str, cases: int, more: int | None = None) -> None:
         super().__init__(why)
-        self.cases, self.more = cases, more
+        self.cases = cases
+        self.more = more
 
 
 def verdicts_of(
@@ -145,13 +145,13 @@ def verdicts_of(
                 )
             except InputError as error:
                 decomposed[condition] = error
-        found = decomposed[condition]
-        if isinstance(found, InputError):
+        decomposition = decomposed[condition]
+        if isinstance(decomposition, InputError):
             answers = int(np.isfinite(some.numbers["error_x_arcsec"]).sum())
-            raise _TooFew(str(found), answers, max(30 - answers, 0) or None)
-        return found
+            raise _TooFew(str(decomposition), answers, max(30 - answers, 0) or None)
+        return decomposition
 
-    found = []
+    verdicts = []
     for require in requires:
         chosen = chosen_cases(require.condition, cases)
         some = cases.some(chosen)
@@ -160,12 +160,12 @@ def verdicts_of(
                 require, some, partial(parts, require.condition, some), np.random.default_rng(seed)
             )
         except _TooFew as few:
-            found.append(
+            verdicts.append(
                 RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, str(few))
             )
             continue
-        found.append(_judged(require, figure, bench_arcsec))
-    return found
+        verdicts.append(_judged(require, figure, bench_arcsec))
+    return verdicts
 
 
 def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:
@@ -215,12 +215,14 @@ def _more(require: Require, figure: _Figure) -> int | None:
     """How many more cases would decide, if the figure stays as it is; None where no number of
     cases would.
     """
-    limit, maximum, c = require.limit, require.minimum is None, require.confidence
+    limit = require.limit
+    maximum = require.minimum is None
+    c = require.confidence
     if figure.rate is not None:
         count, of = figure.rate
-        share, allowed = (
-            count / of,
-            limit if require.quantity in ("availability", "wrong-rate") else 1 - _share(require),
+        share = count / of
+        allowed = (
+            limit if require.quantity in ("availability", "wrong-rate") else 1 - _share(require)
         )
 
         def decided(cases: int) -> bool:
@@ -235,13 +237,17 @@ def _more(require: Require, figure: _Figure) -> int | None:
         if share == allowed or not decided(MAX_MORE):
             return None
         # by halves: a count's steps move the end by a case or two
-        few, enough = figure.cases, MAX_MORE
+        few = figure.cases
+        enough = MAX_MORE
         while enough - few > 1:
             middle = (few + enough) // 2
             few, enough = (few, middle) if decided(middle) else (middle, enough)
         return enough - figure.cases
     away = abs(limit - figure.value)
-    width = figure.high - figure.value if limit > figure.value else figure.value - figure.low
+    if limit > figure.value:
+        width = figure.high - figure.value
+    else:
+        width = figure.value - figure.low
     if not away or not math.isfinite(width) or width <= 0:
         return None
     more = math.ceil(figure.cases * (width / away) ** 2) - figure.cases
@@ -249,41 +255,47 @@ def _more(require: Require, figure: _Figure) -> int | None:
 
 
 def _share(require: Require) -> float:
-    return TIME_SHARE if require.share is None else require.share
+    if require.share is None:
+        return TIME_SHARE
+    return require.share
 
 
 def _figure(
     require: Require, cases: Columns, parts: Callable[[], Decomposed], rng: np.random.Generator
 ) -> _Figure:
-    quantity, c = require.quantity, require.confidence
-    axes, count = AXIS_INDICES[require.axis or "cross"], len(cases.numbers["frames"])
+    quantity = require.quantity
+    c = require.confidence
+    axes = AXIS_INDICES[require.axis or "cross"]
+    count = len(cases.numbers["frames"])
     if not count:
         raise _TooFew("no case meets its condition", 0)
     if quantity in ("availability", "wrong-rate"):
         solved, wrong = (np.nan_to_num(cases.numbers[name]) for name in ("solved", "wrong"))
         asked = np.nan_to_num(cases.numbers["frames"])
-        return (
-            _rate(wrong, solved, c) if quantity == "wrong-rate" else _rate(solved - wrong, asked, c)
-        )
+        if quantity == "wrong-rate":
+            return _rate(wrong, solved, c)
+        return _rate(solved - wrong, asked, c)
     if quantity in ("time-to-first-attitude", "recovery"):
         return _time(require, cases)
     if quantity == "nea" and np.nansum(cases.numbers["frames"] > 1):
         return _within(cases, axes, require, rng)
-    found = parts()
-    figure = _of_parts(found, axes, require, rng)
-    return (
-        replace(figure, method=f"{figure.method}; {len(found.wrong)} wild answers left out")
-        if len(found.wrong)
-        else figure
-    )
+    components = parts()
+    figure = _of_parts(components, axes, require, rng)
+    if len(components.wrong):
+        return replace(
+            figure, method=f"{figure.method}; {len(components.wrong)} wild answers left out"
+        )
+    return figure
 
 
 def _of_parts(
     found: Decomposed, axes: list[int], require: Require, rng: np.random.Generator
 ) -> _Figure:
     """A figure of the error budget's parts."""
-    quantity, c = require.quantity, require.confidence
-    n, components = len(found.row), found.components
+    quantity = require.quantity
+    c = require.confidence
+    n = len(found.row)
+    components = found.components
     if quantity == "bias":
         total = components.left + components.fov.fitted + components.pixel.fitted
         return _bias(components.mean[axes], total[:, axes].std(axis=0, ddof=1), n, c)
@@ -292,7 +304,10 @@ def _of_parts(
         return _noise(
             components.left[:, axes] * math.sqrt(n / max(freedom, 1.0)), freedom, require, rng
         )
-    part = components.fov if quantity == "fov-error" else components.pixel
+    if quantity == "fov-error":
+        part = components.fov
+    else:
+        part = components.pixel
     if part.reason:
         raise _TooFew(part.reason, n)
     return _repeating(part, components.noise_variance, axes, require, rng)
@@ -302,28 +317,36 @@ def clopper_pearson(count: float, of: float, confidence: float) -> tuple[float, 
     """The one-sided limits of a rate of which `count` in `of` were seen, each at this
     confidence.
     """
-    low = 0.0 if count <= 0 else float(stats.beta.ppf(1 - confidence, count, of - count + 1))
-    high = 1.0 if count >= of else float(stats.beta.ppf(confidence, count + 1, of - count))
+    if count <= 0:
+        low = 0.0
+    else:
+        low = float(stats.beta.ppf(1 - confidence, count, of - count + 1))
+    if count >= of:
+        high = 1.0
+    else:
+        high = float(stats.beta.ppf(confidence, count + 1, of - count))
     return low, high
 
 
 def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> _Figure:
     """The rate of hits (n,) among what was asked (n,) of each case."""
-    hits, asked = hits[asked > 0], asked[asked > 0]
-    cases, total = len(asked), float(asked.sum())
+    hits = hits[asked > 0]
+    asked = asked[asked > 0]
+    cases = len(asked)
+    total = float(asked.sum())
     if not cases:
         raise _TooFew("there is no answer", 0)
-    share, effective, method = float(hits.sum()) / total, total, "Clopper-Pearson"
+    share = float(hits.sum()) / total
+    effective = total
+    method = "Clopper-Pearson"
     if total > cases:
         method += " of cases"
         effective = float(cases)
         if 0 < share < 1 and cases > 1:
             between = cases / (cases - 1) * float(((hits - share * asked) ** 2).sum()) / total**2
             effect = max(between / (share * (1 - share) / total), 1.0)
-            effective, method = (
-                max(total / effect, 1.0),
-                f"Clopper-Pearson, design effect {effect:.3g}",
-            )
+            effective = max(total / effect, 1.0)
+            method = f"Clopper-Pearson, design effect {effect:.3g}"
     low, high = clopper_pearson(share * effective, effective, confidence)
     return _Figure(share, low, high, cases, method, (share * effective, effective))
 
@@ -332,7 +355,8 @@ def quantile_limits(values: FloatArray, share: float, confidence: float) -> tupl
     """One-sided limits of the `share` quantile of values (n,) by order statistics; infinite
     where there are too few.
     """
-    ordered, n = np.sort(values), len(values)
+    ordered = np.sort(values)
+    n = len(values)
     # the smallest k with P(count <= k) >= confidence
     upper = int(stats.binom.ppf(confidence, n, share))
     lower = int(stats.binom.ppf(1 - confidence, n, share))
@@ -359,21 +383,21 @@ def _time(require: Require, cases: Columns) -> _Figure:
         else ("recovery_s", "fault_end_s")
     )
     if column not in numbers or known not in numbers:
-        why = (
-            "the table has no such column: a plan that varies scenario has"
-            if column == "recovery_s"
-            else "no such column"
-        )
+        if column == "recovery_s":
+            why = "the table has no such column: a plan that varies scenario has"
+        else:
+            why = "no such column"
         raise _TooFew(f"{column}: {why}", 0)
-    seen = np.isfinite(numbers[known])
-    if not seen.any():
+    is_timed = np.isfinite(numbers[known])
+    if not is_timed.any():
         raise _TooFew("no fault ended within a case", 0)
-    times = np.where(np.isfinite(numbers[column]), numbers[column], math.inf)[seen]
+    times = np.where(np.isfinite(numbers[column]), numbers[column], math.inf)[is_timed]
     return _quantile(times, require, len(times), "order statistics")
 
 
 def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> _Figure:
-    standard, size = sigma / math.sqrt(n), np.abs(mean)
+    standard = sigma / math.sqrt(n)
+    size = np.abs(mean)
     upper = stats.t.ppf(confidence, n - 1)
     # Bonferroni: of several axes any one may be the larger
     lower = stats.t.ppf(1 - (1 - confidence) / len(size), n - 1)
@@ -390,10 +414,12 @@ def _sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[f
 
 def _noise(left: FloatArray, freedom: float, require: Require, rng: np.random.Generator) -> _Figure:
     """The noise of errors (n, axes) that already have the spread of the noise itself."""
-    n, c = len(left), require.confidence
+    n = len(left)
+    c = require.confidence
     if require.share is not None:
         return _quantile(np.abs(left).ravel(), require, n, "order statistics")
-    variance, freedom = float((left**2).mean()), max(freedom, 1.0)
+    variance = float((left**2).mean())
+    freedom = max(freedom, 1.0)
     # Few values cannot show that they are not Gaussian.
     if n < MIN_TESTED or float(stats.kurtosistest(left.ravel()).pvalue) > GAUSSIAN_P:
         low, high = _sigma_limits(variance, freedom * left.shape[1], c)
@@ -409,13 +435,15 @@ def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Ge
     some = np.isfinite(scatter).all(axis=1) & (answers > 1)
     if not some.any():
         raise _TooFew("no case has two right answers", 0)
-    square, freedom = (scatter[some] ** 2).mean(axis=1), answers[some] - 1
-    variance, n, method = (
-        float(square @ freedom / freedom.sum()),
-        int(some.sum()),
-        "chi-square, Gaussian",
-    )
-    factor = 1.0 if require.share is None else float(stats.norm.ppf((1 + require.share) / 2))
+    square = (scatter[some] ** 2).mean(axis=1)
+    freedom = answers[some] - 1
+    variance = float(square @ freedom / freedom.sum())
+    n = int(some.sum())
+    method = "chi-square, Gaussian"
+    if require.share is None:
+        factor = 1.0
+    else:
+        factor = float(stats.norm.ppf((1 + require.share) / 2))
     excess = float((freedom * len(axes) * (square / max(variance, 1e-300) - 1) ** 2).mean()) / 2 - 1
     # 14: the variance of that square, one degree of freedom a case
     if n < MIN_TESTED or excess < 3 * math.sqrt(14 / n):
@@ -445,11 +473,13 @@ def _repeating(
     require: Require,
     rng: np.random.Generator,
 ) -> _Figure:
-    n, c = len(part.fitted), require.confidence
-    noise, variance = float(noise_variance[axes].mean()), float(part.variance[axes].mean())
+    n = len(part.fitted)
+    c = require.confidence
+    noise = float(noise_variance[axes].mean())
+    variance = float(part.variance[axes].mean())
     taken = part.freedom / n * noise
     square = (part.fitted[:, axes] ** 2).mean(axis=1)
-    low, high = (max(each - taken, 0.0) for each in _drawn(square, np.ones(n), rng, c).tolist())
+    low, high = (max(bound - taken, 0.0) for bound in _drawn(square, np.ones(n), rng, c).tolist())
     if part.freedom:  # the noise in the fit: its own power, and what it adds to that of the part
         power = noise * (2 * part.freedom * noise / n + 4 * variance) / (n * len(axes))
         hidden = float(stats.norm.ppf(c)) * math.sqrt(power)

@@ -91,17 +91,27 @@ def write_requirements(
     """Write requirements.csv, .html and .png beside a campaign's table; the verdicts. Raises
     InputError.
     """
-    cases, tracker = read_cases(table), file.config.tracker
+    cases = read_cases(table)
+    tracker = file.config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
-    certificate = bench_certificate(file) if plan.through == "bench" else None
-    own = None if certificate is None else certificate.attitude_arcsec
-    found = verdicts_of(plan.require, cases, scale, plan.seed, own)
+    if plan.through == "bench":
+        certificate = bench_certificate(file)
+    else:
+        certificate = None
+    if certificate is None:
+        bench_arcsec = None
+    else:
+        bench_arcsec = certificate.attitude_arcsec
+    verdicts = verdicts_of(plan.require, cases, scale, plan.seed, bench_arcsec)
     write_csv(
         table.with_name("requirements.csv"),
         COLUMNS,
-        [[summary_of(each)[name] for name in COLUMNS] for each in found],
+        [
+            [summary_of(requirement_verdict)[name] for name in COLUMNS]
+            for requirement_verdict in verdicts
+        ],
     )
-    figure = _chart(cases, found)
+    figure = _chart(cases, verdicts)
     write_whole(table.with_name("requirements.png"), png(figure))
     about = [
         ("plan", str(path)),
@@ -113,20 +123,20 @@ def write_requirements(
         ("program", f"hilstar {__version__}"),
         *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
-    parts = [_verdicts(found).html(), _error_card(figure).html()]
+    parts = [_verdicts(verdicts).html(), _error_card(figure).html()]
     parts.append(Card("Campaign", words=[table_of(about)]).html())
     names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
     parts.append(Card("Signed", words=[names]).html())
-    page = page_of(f"Requirements of {path.name}", _verdict(found), parts)
+    page = page_of(f"Requirements of {path.name}", _verdict(verdicts), parts)
     write_whole(table.with_name("requirements.html"), page)
-    return found
+    return verdicts
 
 
 def _verdict(found: list[RequirementVerdict]) -> Verdict:
     whole = verdict_of(found)
     texts = []
     for verdict in (MET, NOT_MET, NOT_SHOWN):
-        count = sum(each.verdict == verdict for each in found)
+        count = sum(requirement_verdict.verdict == verdict for requirement_verdict in found)
         if count:
             texts.append(f"{count} {verdict}")
     return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(found)}: {', '.join(texts)}.")
@@ -172,8 +182,12 @@ def summary_of(each: RequirementVerdict) -> dict[str, Any]:
 
 def verdict_of(found: list[RequirementVerdict]) -> str:
     """The verdict of all together: the worst."""
-    verdicts = {each.verdict for each in found}
-    return NOT_MET if NOT_MET in verdicts else NOT_SHOWN if NOT_SHOWN in verdicts else MET
+    verdicts = {requirement_verdict.verdict for requirement_verdict in found}
+    if NOT_MET in verdicts:
+        return NOT_MET
+    if NOT_SHOWN in verdicts:
+        return NOT_SHOWN
+    return MET
 
 
 def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
@@ -206,7 +220,8 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
             positive = at[known] > 0
             if rated and positive.all() and at[known].max() > 30 * at[known].min():
                 axes.set_xscale("log")
-            low, high = float(at[known].min()), float(at[known].max())
+            low = float(at[known].min())
+            high = float(at[known].max())
             top = 1.15 * max(
                 float(np.quantile(error[known], 0.97)),
                 *sigma,
@@ -218,9 +233,9 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
                 axes.plot(
                     [begin, end], [each.require.limit] * 2, color=COLOURS[each.verdict], lw=2.2
                 )
-                words = f"{each.require.quantity} {each.verdict}"
+                bar_text = f"{each.require.quantity} {each.verdict}"
                 axes.annotate(
-                    words,
+                    bar_text,
                     (begin, each.require.limit),
                     (2, 3),
                     textcoords="offset points",
@@ -239,7 +254,8 @@ def _error_and_rate(cases: Columns) -> tuple[FloatArray, FloatArray]:
     x, y = (cases.numbers[f"error_{axis}_arcsec"] for axis in "xy")
     known = np.isfinite(x) & np.isfinite(y)
     if known.any():
-        x, y = x - np.median(x[known]), y - np.median(y[known])
+        x = x - np.median(x[known])
+        y = y - np.median(y[known])
     names = [name for name in cases.varied if name.startswith(f"{VARY}rate_deg_s.")]
     rate = np.full(len(x), np.nan)
     if names:

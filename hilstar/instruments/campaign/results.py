@@ -271,8 +271,11 @@ def measures(cases: Columns) -> list[Measure]:
     """
     numbers = cases.numbers
     errors = (numbers[f"error_{axis}_arcsec"] for axis in "xyz")
-    x, y, z = (each - np.nanmedian(each) if np.isfinite(each).any() else each for each in errors)
-    found = [
+    x, y, z = (
+        axis_errors - np.nanmedian(axis_errors) if np.isfinite(axis_errors).any() else axis_errors
+        for axis_errors in errors
+    )
+    error_measures = [
         Measure("cross", "arcsec", np.sqrt((x**2 + y**2) / 2)),
         Measure("roll", "arcsec", np.abs(z)),
     ]
@@ -280,20 +283,28 @@ def measures(cases: Columns) -> list[Measure]:
         dx, dy, sx, sy = (
             numbers[f"centroid_{name}_px"] for name in ("dx", "dy", "sigma_x", "sigma_y")
         )
-        found.append(Measure("centroid", "px", np.sqrt((dx**2 + dy**2 + sx**2 + sy**2) / 2)))
+        error_measures.append(
+            Measure("centroid", "px", np.sqrt((dx**2 + dy**2 + sx**2 + sy**2) / 2))
+        )
     right = np.nan_to_num(numbers["solved"]) - np.nan_to_num(numbers["wrong"])
     frames = np.maximum(np.nan_to_num(numbers["frames"], nan=1.0), 1.0)
-    found.append(Measure("unanswered", "1", 1 - np.minimum(right / frames, 1.0), mean=True))
-    return [measure for measure in found if np.isfinite(measure.values).sum() >= 2 * MIN_IN_BIN]
+    error_measures.append(
+        Measure("unanswered", "1", 1 - np.minimum(right / frames, 1.0), mean=True)
+    )
+    return [
+        measure for measure in error_measures if np.isfinite(measure.values).sum() >= 2 * MIN_IN_BIN
+    ]
 
 
 def costs(cases: Columns) -> list[Cost]:
     """The cost of each varied parameter in each measure, the largest first within a measure."""
-    found = []
+    varied_costs = []
     for measure in measures(cases):
-        each = [cost for name in cases.varied if (cost := _cost(measure, name, cases)) is not None]
-        found += sorted(each, key=lambda cost: (not cost.sure, -cost.cost))
-    return found
+        measure_costs = [
+            cost for name in cases.varied if (cost := _cost(measure, name, cases)) is not None
+        ]
+        varied_costs += sorted(measure_costs, key=lambda cost: (not cost.sure, -cost.cost))
+    return varied_costs
 
 
 def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
@@ -303,7 +314,8 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
         return None
     y = measure.values[good]
     levels, errors = np.array([_level(y[index == k], measure.mean) for k in range(len(places))]).T
-    best, worst = int(np.argmin(levels)), int(np.argmax(levels))
+    best = int(np.argmin(levels))
+    worst = int(np.argmax(levels))
     return Cost(
         measure=measure.name,
         unit=measure.unit,
@@ -353,7 +365,10 @@ def _bins(
 
     Few distinct values are bins themselves.
     """
-    column = np.array(cases.texts[name]) if name in cases.texts else cases.numbers[name]
+    if name in cases.texts:
+        column = np.array(cases.texts[name])
+    else:
+        column = cases.numbers[name]
     values, index = np.unique(column[good], return_inverse=True)
     if name not in cases.texts and len(values) > MAX_BINS:
         numbers = cases.numbers[name][good]
@@ -362,12 +377,15 @@ def _bins(
         filled, index = np.unique(np.searchsorted(ends, numbers, side="right"), return_inverse=True)
         values = np.array([np.median(numbers[index == k]) for k in range(len(filled))])
     enough = len(values) < 2 or np.bincount(index).min() >= MIN_IN_BIN // 2
-    return (tuple(values.tolist()), index) if enough else ((), index)
+    if enough:
+        return (tuple(values.tolist()), index)
+    return ((), index)
 
 
 def finding(found: list[Cost]) -> str:
     """The parameter that costs most of a measure, in one line."""
-    first, what = found[0], WORDS[found[0].measure]
+    first = found[0]
+    what = WORDS[found[0].measure]
     if not first.sure:
         return (
             f"No parameter changes the {what} beyond these cases' noise:"
@@ -385,7 +403,9 @@ def finding(found: list[Cost]) -> str:
 
 
 def _figure(value: float, cost: Cost) -> str:
-    return f"{100 * value:.3g} %" if cost.unit == "1" else f"{value:.3g} {cost.unit}"
+    if cost.unit == "1":
+        return f"{100 * value:.3g} %"
+    return f"{value:.3g} {cost.unit}"
 
 
 def cost_chart(found: list[Cost]) -> Any:
@@ -423,7 +443,7 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     budget, parts = case_budget(cases, file, np.random.default_rng(seed))
     budget_table = list(budget_rows(budget, parts))
     write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_table)
-    found = costs(cases)
+    varied_costs = costs(cases)
     names = (
         "measure",
         "unit",
@@ -437,30 +457,32 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         "worst",
         "at_worst",
     )
-    rows = [
-        (
-            *(
-                each.measure,
-                each.unit,
-                each.parameter,
-                each.overall,
-                each.cost,
-                each.share,
-                str(each.sure).lower(),
-            ),
-            *(
-                each.places[each.best],
-                float(each.level[each.best]),
-                each.places[each.worst],
-                float(each.level[each.worst]),
-            ),
+    rows = []
+    for varied_cost in varied_costs:
+        rows.append(
+            (
+                *(
+                    varied_cost.measure,
+                    varied_cost.unit,
+                    varied_cost.parameter,
+                    varied_cost.overall,
+                    varied_cost.cost,
+                    varied_cost.share,
+                    str(varied_cost.sure).lower(),
+                ),
+                *(
+                    varied_cost.places[varied_cost.best],
+                    float(varied_cost.level[varied_cost.best]),
+                    varied_cost.places[varied_cost.worst],
+                    float(varied_cost.level[varied_cost.worst]),
+                ),
+            )
         )
-        for each in found
-    ]
     write_csv(table.with_name("sensitivity.csv"), names, rows)
-    findings, charts = [], {}
-    for measure in dict.fromkeys(cost.measure for cost in found):
-        of_it = [cost for cost in found if cost.measure == measure]
+    findings = []
+    charts = {}
+    for measure in dict.fromkeys(cost.measure for cost in varied_costs):
+        of_it = [cost for cost in varied_costs if cost.measure == measure]
         if max(float(cost.level.max()) for cost in of_it) > 0:
             figure = charts[WORDS[measure]] = cost_chart(of_it)
             write_whole(table.with_name(f"sensitivity_{measure}.png"), png(figure))

@@ -50,7 +50,8 @@ class Campaign:
     ) -> None:
         require_parquet()
         text = read_text(path, "give the path of a plan", MAX_TOML_BYTES)
-        self.path, self.directory = path, directory
+        self.path = path
+        self.directory = directory
         self.plan: Plan = parse_plan(path, text)
         self.file: BenchFile = read_bench_file(path.parent / self.plan.bench)
         self.on_bench = self.plan.through == "bench"
@@ -79,7 +80,8 @@ class Campaign:
             else:
                 session = Session(self.job)
                 try:
-                    self.identity, self.maker = session.identity(), session.maker
+                    self.identity = session.identity()
+                    self.maker = session.maker
                 finally:
                     session.close()
                 self.columns = columns(self.maker.parameters, "stars" in session.columns)
@@ -210,10 +212,9 @@ class Campaign:
         return True
 
     def _write(self, directory: Directory, blocks: Iterator[list[Row]]) -> None:
-        about = {
-            f"hilstar.{name}": (
+        about = {}
+        for name, value in msgspec.to_builtins(self.about()).items():
+            about[f"hilstar.{name}"] = (
                 value if isinstance(value, str) else msgspec.json.encode(value).decode()
             )
-            for name, value in msgspec.to_builtins(self.about()).items()
-        }
         write_table(directory.table, schema_of(self.columns, about), blocks)

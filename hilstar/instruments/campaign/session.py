@@ -123,7 +123,10 @@ class Session:
             view = self.maker.view(case, frame, exposure_s)
             # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and
             # attitude.
-            rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
+            if self.plan.frames == 1:
+                rng = noise.rng()
+            else:
+                rng = noise.rng(frame)
             if isinstance(tracker, Simulator):
                 exposure = tracker.expose(view, rng, faults=self.maker.faults(case, view, tracker))
             else:
@@ -148,9 +151,13 @@ class Session:
 
     def _at(self, file: BenchFile) -> Imaging:
         """The tracker, switched to a bench file; where that fails, the next case gets a new one."""
-        tracker, self._tracker = self._tracker, None
+        tracker = self._tracker
+        self._tracker = None
         if tracker is None:
-            tracker = Simulator(file) if self.plan.through == "tracker" else DisplayTracker(file)
+            if self.plan.through == "tracker":
+                tracker = Simulator(file)
+            else:
+                tracker = DisplayTracker(file)
         else:
             try:
                 tracker.change(file)

@@ -99,12 +99,15 @@ class CentroidSolver:
     """
 
     def __init__(self, settings: Centroiding, folder: Path = Path()) -> None:
-        self._wanted, self._folder = settings, folder
+        self._wanted = settings
+        self._folder = folder
         self._told: tuple[str, Psf, StarGlass | None] | None = None
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """Centroid errors, and the attitude by the matched stars."""
-        wanted, psf, detector = self._wanted, tracker.canvas.psf, tracker.config.tracker.detector
+        wanted = self._wanted
+        psf = tracker.canvas.psf
+        detector = tracker.config.tracker.detector
         if wanted.centroider == "psf" and detector.bayer is not None:
             raise InputError(
                 '[centroids] centroider = "psf": pixels of a mosaic have a PSF each; leave it out,'
@@ -120,7 +123,7 @@ class CentroidSolver:
         )
         truth, (height, width) = exposure.truth, exposure.dn.shape
         image, background = _image_to_search(exposure, tracker)
-        found = find_stars(image, settings, background)
+        stars = find_stars(image, settings, background)
         with np.errstate(invalid="ignore"):
             off_x, off_y = (
                 np.abs(truth[name] - (side - 1) / 2)
@@ -128,21 +131,28 @@ class CentroidSolver:
             )
             truth = truth[(off_x <= width / 2) & (off_y <= height / 2) & truth["drawn"]]
         # The truth is in order of light: of stars with one find, the brightest has it.
-        index = nearest(found, truth["x_px"], truth["y_px"])
+        index = nearest(stars, truth["x_px"], truth["y_px"])
         first = np.isin(np.arange(len(index)), np.unique(index, return_index=True)[1])
         is_matched = first & (index >= 0)
-        good = is_matched & ~truth["clipped"] & ~found.at_edge[index] if len(found) else is_matched
+        if len(stars):
+            good = is_matched & ~truth["clipped"] & ~stars.at_edge[index]
+        else:
+            good = is_matched
         flux = truth["electrons_per_s"]
         if len(truth):
             good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, psf)
-        x_px, y_px, matched = truth["x_px"][good], truth["y_px"][good], int(is_matched.sum())
-        dx_px, dy_px = found.x_px[index[good]] - x_px, found.y_px[index[good]] - y_px
+        x_px = truth["x_px"][good]
+        y_px = truth["y_px"][good]
+        matched = int(is_matched.sum())
+        dx_px = stars.x_px[index[good]] - x_px
+        dy_px = stars.y_px[index[good]] - y_px
         if wanted.centroider == "psf":
             places = self._fitted(
-                exposure, tracker, truth[good], (found.x_px[index[good]], found.y_px[index[good]])
+                exposure, tracker, truth[good], (stars.x_px[index[good]], stars.y_px[index[good]])
             )
-            dx_px, dy_px = places[0] - x_px, places[1] - y_px
-        counts = len(truth), len(found), matched, len(found) - matched
+            dx_px = places[0] - x_px
+            dy_px = places[1] - y_px
+        counts = len(truth), len(stars), matched, len(stars) - matched
         errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good], truth[good])
         if len(x_px) < MIN_STARS:
             return SolverAnswer(
@@ -150,10 +160,10 @@ class CentroidSolver:
             )
         true = normalise(tracker.camera.rays(x_px, y_px))
         known = flight_camera(tracker.config.tracker, tracker.file.folder, tracker.camera)
-        seen = normalise(known.rays(x_px + dx_px, y_px + dy_px))
+        rays = normalise(known.rays(x_px + dx_px, y_px + dy_px))
         # Weights are the stars' light, the inverse of photon noise's variance.
         return SolverAnswer(
-            multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors
+            multiply(wahba(rays, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors
         )
 
     def _fitted(
@@ -174,24 +184,28 @@ class CentroidSolver:
         shares = None
         if glass is not None and self._wanted.psf_spectrum == "star":
             shares = glass.shares_of(tracker.stars, truth["hip"])
-        told = told_psf(psf, pixels, len(near), shares)
-        x_px, y_px = psf_places(stamps, told, (first[0] - pixels[1], first[1] - pixels[0]))
+        psf_stamp = told_psf(psf, pixels, len(near), shares)
+        x_px, y_px = psf_places(stamps, psf_stamp, (first[0] - pixels[1], first[1] - pixels[0]))
         return pixels[1] + x_px, pixels[0] + y_px
 
     def _told_by(self, tracker: SolvedTracker) -> tuple[Psf, StarGlass | None]:
-        wanted, psf = self._wanted, tracker.canvas.psf
+        wanted = self._wanted
+        psf = tracker.canvas.psf
         if wanted.psf == TRACKER_PSF:
             return psf, tracker.glass if isinstance(tracker, Simulator) else None
         if wanted.psf == GAUSSIAN:
             return GaussianPsf(psf.width_px), None
         if self._told is None or self._told[0] != tracker.file.sha256:
             optics = TrackerOptics(psf=str(self._folder / wanted.psf), focus_um=wanted.psf_focus_um)
-            told = tracker_psf(
+            stated_psf = tracker_psf(
                 msgspec.structs.replace(tracker.config.tracker, optics=optics), tracker.file.folder
             )
             simulated = isinstance(tracker, Simulator)
-            glass = star_glass(tracker.file, told) if simulated else None
-            self._told = tracker.file.sha256, told, glass
+            if simulated:
+                glass = star_glass(tracker.file, stated_psf)
+            else:
+                glass = None
+            self._told = tracker.file.sha256, stated_psf, glass
         return self._told[1:]
 
 
@@ -223,7 +237,8 @@ class FunctionSolver:
     """
 
     def __init__(self, name: str, folder: Path, timeout_s: float) -> None:
-        self.name, self._timeout_s = name, timeout_s
+        self.name = name
+        self._timeout_s = timeout_s
         try:
             self._function = user_function(name, folder)
         except UserCodeError as error:
@@ -316,7 +331,8 @@ class CommandSolver:
                 " centroids,"
                 f' python:MODULE:FUNCTION, or a command with {IMAGE} in it, such as "solve {IMAGE}"'
             )
-        self._folder, self._timeout_s = folder, timeout_s
+        self._folder = folder
+        self._timeout_s = timeout_s
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """The command's answer. Raises SolverFault where it fails, takes too long, or its answer
@@ -326,13 +342,14 @@ class CommandSolver:
 
         facts = tracker_facts(tracker)
         with temporary_folder("solver") as folder:
-            image, picture = folder / "image.fits", folder / "image.png"
+            image = folder / "image.fits"
+            picture = folder / "image.png"
             if any(IMAGE in word for word in self._words):
                 # the DN alone: no pointing, and no truth
                 fits.PrimaryHDU(given_image(exposure, tracker)).writeto(image)
             if any(PICTURE in word for word in self._words):
                 write_dn_picture(picture, given_image(exposure, tracker))
-            words = self._words
+            command = self._words
             for place, text in (
                 ("{fov_deg}", f"{facts['fov_deg']:.9g}"),
                 ("{focal_length_px}", f"{facts['focal_length_px']:.9g}"),
@@ -341,12 +358,12 @@ class CommandSolver:
                 (IMAGE, str(image)),
                 (PICTURE, str(picture)),
             ):
-                words = [word.replace(place, text) for word in words]
+                command = [word.replace(place, text) for word in command]
             try:
-                child = Child(words, self._folder)
+                child = Child(command, self._folder)
             except OSError as error:
                 raise SolverFault(
-                    f"the solver cannot be started: {words[0]} ({error.strerror})"
+                    f"the solver cannot be started: {command[0]} ({error.strerror})"
                 ) from error
             with child:
                 code = child.wait(self._timeout_s)
@@ -359,20 +376,18 @@ class CommandSolver:
                 if code is None:
                     raise SolverFault(f"the solver took longer than {self._timeout_s:g} s")
         if code:
-            said = child.err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
+            error_lines = child.err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
             line = (
-                said[0]
+                error_lines[0]
                 .replace(str(image), IMAGE)
                 .replace(str(picture), PICTURE)
                 .replace(str(folder), "")
             )
             raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
         q = printed_attitude(child.out)
-        return (
-            SolverAnswer(None, "the solver found no attitude")
-            if q is None
-            else SolverAnswer(checked_attitude(q, "the solver"))
-        )
+        if q is None:
+            return SolverAnswer(None, "the solver found no attitude")
+        return SolverAnswer(checked_attitude(q, "the solver"))
 
 
 def printed_attitude(text: str) -> object | None:
@@ -382,9 +397,9 @@ def printed_attitude(text: str) -> object | None:
     for line in reversed(text[-MAX_OUTPUT_CHARACTERS:].splitlines()):
         if line.lstrip().startswith("{"):
             with contextlib.suppress(ValueError, RecursionError):
-                said = json.loads(line)
-                if "q" in said:
-                    q: object = said["q"]
+                answer = json.loads(line)
+                if "q" in answer:
+                    q: object = answer["q"]
                     return q
                 continue
         if re.fullmatch(r"[\s,;\[\]()\d.eE+-]+", line):

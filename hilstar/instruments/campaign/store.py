@@ -120,7 +120,8 @@ class Journal:
     """
 
     def __init__(self, folder: Path, cases: int) -> None:
-        self.folder, self.cases = make_directory(folder), cases
+        self.folder = make_directory(folder)
+        self.cases = cases
         self._done: dict[int, set[int]] = {}  # in blocks that are not full
         self._full: set[int] = set()
         self._files: dict[int, int] = {}
@@ -168,13 +169,13 @@ class Journal:
         """The rows of a full block in the order of their cases. Raises InputError where one is
         missing.
         """
-        found = self._read(self._path(block, FULL))[0]
-        if len(found) != len(self._block(block)):
+        rows_by_case = self._read(self._path(block, FULL))[0]
+        if len(rows_by_case) != len(self._block(block)):
             raise InputError(
                 f"{self._path(block, FULL)}: rows of cases are missing in it; delete it, and run"
                 " the same command again"
             )
-        return [found[case] for case in sorted(found)]
+        return [rows_by_case[case] for case in sorted(rows_by_case)]
 
     def close(self) -> None:
         """Close the files."""
@@ -223,17 +224,19 @@ class Journal:
     def _mended(self, block: int) -> list[int]:
         """The cases in an unfinished block, after cut lines were dropped from its file."""
         path = self._path(block, OPEN)
-        found, whole = self._read(path)
+        rows_by_case, whole = self._read(path)
         if not whole:
-            write_whole(path, b"".join(_line(row) for row in found.values()))
-        if len(found) == len(self._block(block)):  # killed between the last row and the new name
+            write_whole(path, b"".join(_line(row) for row in rows_by_case.values()))
+        if len(rows_by_case) == len(
+            self._block(block)
+        ):  # killed between the last row and the new name
             self._files[block] = os.open(
                 path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
             )
-            self._done[block] = set(found)
+            self._done[block] = set(rows_by_case)
             self._close_block(block)
             return []
-        return list(found)
+        return list(rows_by_case)
 
     def _read(self, path: Path) -> tuple[dict[int, Row], bool]:
         """The rows of a file by case, and whether all its lines were whole."""
@@ -243,20 +246,20 @@ class Journal:
             raise InputError(
                 f"{path}: cannot be read ({error.strerror}); run the same command again"
             ) from error
-        found: dict[int, Row] = {}
+        rows_by_case: dict[int, Row] = {}
         lines = data.split(b"\n")
         whole = lines.pop() == b""
         for line in lines:
             row = _row(line)
             if (
                 row is None
-                or row["case"] in found
+                or row["case"] in rows_by_case
                 or row["case"] not in self._block(int(path.name[:6]))
             ):
                 whole = False
             else:
-                found[row["case"]] = row
-        return found, whole
+                rows_by_case[row["case"]] = row
+        return rows_by_case, whole
 
 
 def _line(row: Row) -> bytes:

@@ -83,7 +83,8 @@ def read_bench(file: BenchFile, reader: Reader) -> Read:
     """Read a bench for a certificate: its response, one pattern of dots, its delay. Raises
     InputError, MachineError.
     """
-    certify, rng = file.config.certify, np.random.default_rng(SEED)
+    certify = file.config.certify
+    rng = np.random.default_rng(SEED)
     codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
     light = light_deviation(file, reader.light(codes))
     dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
@@ -97,15 +98,14 @@ def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generato
     """
     count = min(levels, white)
     wanted = next(
-        found
+        distinct
         for n in itertools.count(count)
-        if len(found := np.unique(np.rint(np.geomspace(1, white, n)))) >= count
+        if len(distinct := np.unique(np.rint(np.geomspace(1, white, n)))) >= count
     )
     order = rng.permutation(np.repeat(wanted.astype(np.intp), repeats))
-    rounds = [
-        np.concatenate([[0, white], order[k : k + READINGS_A_ROUND]])
-        for k in range(0, len(order), READINGS_A_ROUND)
-    ]
+    rounds = []
+    for k in range(0, len(order), READINGS_A_ROUND):
+        rounds.append(np.concatenate([[0, white], order[k : k + READINGS_A_ROUND]]))
     return np.asarray(np.concatenate([*rounds, [0, white]]), dtype=np.intp)
 
 
@@ -134,7 +134,8 @@ def assemble(
     `checked`; None: not looked at.
     """
     figures = Figures(file, reference_stars(file))
-    count, lights = len(figures.stars), len(figures.log_light)
+    count = len(figures.stars)
+    lights = len(figures.log_light)
     value = Deviations(
         np.ones((1, lights)), np.zeros((1, count)), np.zeros((1, count, 2)),
         np.array([file.config.monitor.panel_delay_ms]), np.zeros(1),
@@ -158,7 +159,9 @@ def assemble(
 
     def model(variables: list[FloatArray]) -> FloatArray:
         def total(name: str) -> FloatArray | float:
-            parts = [(z, getattr(each, name)) for z, each in zip(variables, effects, strict=True)]
+            parts = [
+                (z, getattr(effect, name)) for z, effect in zip(variables, effects, strict=True)
+            ]
             return sum(
                 (np.tensordot(z, slopes, axes=1) for z, slopes in parts if slopes is not None),
                 start=0.0,
@@ -171,11 +174,11 @@ def assemble(
                 for n, m in KINDS
             )
         )
-        found = figures.of(off)
+        figure_values = figures.of(off)
         sky = np.zeros((trials, len(SKY), count)) + total("sky")
-        sky += found[:, : 3 * count].reshape(trials, 3, count)
+        sky += figure_values[:, : 3 * count].reshape(trials, 3, count)
         sky[:, 0] += quantised
-        return np.concatenate([found, sky.reshape(trials, -1)], axis=1)
+        return np.concatenate([figure_values, sky.reshape(trials, -1)], axis=1)
 
     return Assembled([each.input for each in effects], model, names, figures, missing)
 
@@ -185,7 +188,8 @@ def _of_readings(
 ) -> tuple[Deviations, list[Effect]]:
     light = read.light
     join = light.weights(figures.log_light)
-    dark, lasting = (join @ light.dark_factors).T, (join @ light.lasting_factors).T
+    dark = (join @ light.dark_factors).T
+    lasting = (join @ light.lasting_factors).T
     fit = read.even.fit
     read_px = _places_in(light.square_px)
     even = fit.terms(figures.x_px, figures.y_px) - fit.terms(*read_px).mean(axis=0)
@@ -195,7 +199,10 @@ def _of_readings(
     bent = light.bent(figures.log_light) / 2 / math.sqrt(6)  # the spline is the more likely of both
     rough = light.rough(figures.log_light)
     late_ms = read.delays_ms
-    delay = float(late_ms.mean()) if len(late_ms) > 1 else file.config.monitor.panel_delay_ms
+    if len(late_ms) > 1:
+        delay = float(late_ms.mean())
+    else:
+        delay = file.config.monitor.panel_delay_ms
     value = Deviations(
         (join @ light.value)[None],
         (even @ fit.value[:, 0] - form / 2)[None],
@@ -203,8 +210,11 @@ def _of_readings(
         np.array([delay]),
         np.zeros(1),
     )
-    white = math.sqrt(read.even.found.noise_variance) / fit.noise if read.even.found.total else 1.0
-    found = [
+    if read.even.found.total:
+        white = math.sqrt(read.even.found.noise_variance) / fit.noise
+    else:
+        white = 1.0
+    effects = [
         Effect(
             Input(
                 "response",
@@ -276,23 +286,22 @@ def _of_readings(
             place=place.noise,
         ),
     ]
-    found += _of_structure(figures, read, lasting, rough)
+    effects += _of_structure(figures, read, lasting, rough)
     if len(late_ms) > 1:
-        found += _of_delays(late_ms)
+        effects += _of_delays(late_ms)
     else:
-        found += _stated_delay(file, missing)
-    return value, found
+        effects += _stated_delay(file, missing)
+    return value, effects
 
 
 def _of_delays(late_ms: FloatArray) -> Iterator[Effect]:
     """The effects of edges (n,) that a photodiode saw: of each by itself, and of what correlates
     from one to the next.
     """
-    count, order = len(late_ms), np.arange(len(late_ms), dtype=np.float64)
-    lasts, source = (
-        in_time(order, late_ms - late_ms.mean(), np.ones((count, 1))),
-        f"{count} edges of a photodiode",
-    )
+    count = len(late_ms)
+    order = np.arange(len(late_ms), dtype=np.float64)
+    lasts = in_time(order, late_ms - late_ms.mean(), np.ones((count, 1)))
+    source = f"{count} edges of a photodiode"
     error = math.sqrt(lasts.noise_variance / count)
     yield Effect(
         Input("delay", "Student t", source, 1, error, "ms", count - 1.0), delay=np.array([error])
@@ -308,11 +317,10 @@ def _of_delays(late_ms: FloatArray) -> Iterator[Effect]:
 def _places_in(square_px: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Places (n,) all over a square of the screen, left, top and side, px."""
     left, top, side = square_px
-    along = (
-        (np.arange(PLACES_IN_SQUARE) + 0.5) / PLACES_IN_SQUARE * side - 0.5
-        if side > 1
-        else np.zeros(1)
-    )
+    if side > 1:
+        along = (np.arange(PLACES_IN_SQUARE) + 0.5) / PLACES_IN_SQUARE * side - 0.5
+    else:
+        along = np.zeros(1)
     x, y = np.meshgrid(left + along, top + along)
     return x.ravel(), y.ravel()
 
@@ -323,12 +331,12 @@ def _of_structure(
     """The effects of what the residuals have left of structure, where they have it: in time, of
     codes, of light, of places.
     """
-    light, even, place = read.light, read.even, read.place.at(figures.x_px, figures.y_px)
+    light = read.light
+    even = read.even
+    place = read.place.at(figures.x_px, figures.y_px)
     if light.lasting.total:
-        error, source = (
-            light.noise * math.sqrt(light.lasting.total),
-            "readings that correlate from one to the next",
-        )
+        error = light.noise * math.sqrt(light.lasting.total)
+        source = "readings that correlate from one to the next"
         yield Effect(
             Input(
                 "noise that lasts",
@@ -363,13 +371,16 @@ def _of_structure(
             levels=np.diag(rough),
         )
     if even.found.total:
-        count, read_px = len(figures.stars), _places_in(light.square_px)
+        count = len(figures.stars)
+        read_px = _places_in(light.square_px)
         shares = np.concatenate(
             [np.eye(count), np.full((count, len(read_px[0])), -1 / len(read_px[0]))], axis=1
         )
-        x, y = np.append(figures.x_px, read_px[0]), np.append(figures.y_px, read_px[1])
+        x = np.append(figures.x_px, read_px[0])
+        y = np.append(figures.y_px, read_px[1])
         scatter = even.scatter(x, y, shares)
-        error, length = math.sqrt(even.found.total), even.found.mean_length
+        error = math.sqrt(even.found.total)
+        length = even.found.mean_length
         source = (
             f"light of dots about its map, over {length:.0f} px: the screen's, at each star's place"
         )
@@ -380,7 +391,8 @@ def _of_structure(
             even=scatter,
         )
     if place.found.total:
-        error, length = math.sqrt(place.found.total), place.found.mean_length
+        error = math.sqrt(place.found.total)
+        length = place.found.mean_length
         source = f"places of dots about the lens, which correlate over {length:.0f} px"
         yield Effect(
             Input(
@@ -402,25 +414,33 @@ def _of_files(
     """The effects of a bench's calibration files and stated errors, and in `value` what the
     response has wrong.
     """
-    monitor, certify, count = file.config.monitor, file.config.certify, len(figures.stars)
+    monitor = file.config.monitor
+    certify = file.config.certify
+    count = len(figures.stars)
     name = monitor.calibration
-    known = None if name in BUILT_IN else read_toml(file.folder / name)
-    errors, light_map = (
-        None if known is None else known.errors,
-        bench_calibration(file.config, file.folder),
-    )
+    if name in BUILT_IN:
+        known = None
+    else:
+        known = read_toml(file.folder / name)
+    errors = None if known is None else known.errors
+    light_map = bench_calibration(file.config, file.folder)
     if errors is None:
         missing.append(f"flux: [monitor] calibration = {name!r} does not say how well it is known")
     else:
-        light, relative = np.log(np.array(errors.light)), np.array(errors.relative)
+        light = np.log(np.array(errors.light))
+        relative = np.array(errors.relative)
         join = CubicSpline(light, np.eye(len(light)), bc_type="natural")(
             np.clip(figures.log_light, light[0], light[-1])
         )
         join = join - np.eye(len(light))[-1]  # relative to white, whose light is full scale
         value.levels[0] += join @ np.array(errors.off)
-        common = errors.black if errors.common is None else errors.common
+        if errors.common is None:
+            common = errors.black
+        else:
+            common = errors.common
         black = common / np.array(errors.light)  # common to all levels
-        own, source = np.sqrt(np.maximum(relative**2 - black**2, 0.0)), f"levels of {name}"
+        own_relative = np.sqrt(np.maximum(relative**2 - black**2, 0.0))
+        source = f"levels of {name}"
         yield Effect(
             Input(
                 "response",
@@ -431,11 +451,12 @@ def _of_files(
                 "relative",
                 errors.dof,
             ),
-            levels=np.concatenate([(join * own).T, (join @ black)[None]]),
+            levels=np.concatenate([(join * own_relative).T, (join @ black)[None]]),
         )
     if (white := certify.flux_at_white_relative) is not None:
         dof = certify.flux_at_white_dof or math.inf
-        source, kind = "[certify] flux_at_white_relative", _by_freedom(dof)
+        source = "[certify] flux_at_white_relative"
+        kind = _by_freedom(dof)
         yield Effect(
             Input("full scale", kind, source, 1, white, "relative", dof),
             even=np.full((1, count), white),
@@ -479,7 +500,10 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
     alignment.
     """
     name = file.config.collimator.geometry
-    error = None if name is None else load_notes(file.folder / name).error
+    if name is None:
+        error = None
+    else:
+        error = load_notes(file.folder / name).error
     if error is None or (error.map_arcsec is None and error.alignment_covariance_arcsec2 is None):
         missing.append(
             "place and attitude: [collimator] geometry names no file with its errors (hilstar"
@@ -499,10 +523,8 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
 
         known = seen(np.where(np.isnan(rows), np.nanmax(rows), rows)) / math.sqrt(2)
         if error.modes_arcsec is None:
-            place, source = (
-                np.eye(2)[:, None] * known[:, None],
-                f"map of errors of {name}, all stars together",
-            )
+            place = np.eye(2)[:, None] * known[:, None]
+            source = f"map of errors of {name}, all stars together"
         else:
             modes = np.array(error.modes_arcsec).reshape(-1, 2, *rows.shape)
             place = np.stack([[seen(axis) for axis in mode] for mode in modes]).transpose(0, 2, 1)
@@ -515,16 +537,12 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
             f"lens: {name} has no errors of the lens, and those of its alignment alone count"
         )
     if error.alignment_covariance_arcsec2 is not None:
-        covariance, dof = (
-            np.array(error.alignment_covariance_arcsec2),
-            error.alignment_dof or math.inf,
-        )
+        covariance = np.array(error.alignment_covariance_arcsec2)
+        dof = error.alignment_dof or math.inf
         size, axes = np.linalg.eigh(covariance)
         turns = (axes * np.sqrt(np.maximum(size, 0.0))).T
-        source, rms = (
-            f"covariance of the rotation of {name}",
-            math.sqrt(max(float(size.mean()), 0.0)),
-        )
+        source = f"covariance of the rotation of {name}"
+        rms = math.sqrt(max(float(size.mean()), 0.0))
         yield Effect(
             Input("alignment", _by_freedom(dof), source, 3, rms, "arcsec", dof),
             place=figures.turned(turns),
@@ -547,9 +565,11 @@ def _stated_delay(file: BenchFile, missing: list[str]) -> Iterator[Effect]:
 def _of_warm_up(
     file: BenchFile, count: int, seen: float | None, missing: list[str]
 ) -> Iterator[Effect]:
-    source, known = "white in the next ten minutes (--warm-up)", file.config.certify.warm_up_percent
+    source = "white in the next ten minutes (--warm-up)"
+    known = file.config.certify.warm_up_percent
     if seen is None and known is not None:
-        seen, source = known / 100, "[certify] warm_up_percent"
+        seen = known / 100
+        source = "[certify] warm_up_percent"
     if seen is None:
         missing.append(
             "warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is"
@@ -573,12 +593,12 @@ def _of_drift(
             "drift since the certificate: no check has been made (hilstar certify --check)"
         )
         return
-    names, count = (
-        ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency"),
-        len(figures.stars),
-    )
+    names = ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency")
+    count = len(figures.stars)
     light, x, y, turn, scale, late = (checked.get(name, 0.0) / math.sqrt(3) for name in names)
-    even, place, delay = np.zeros((6, count)), np.zeros((6, count, 2)), np.zeros(6)
+    even = np.zeros((6, count))
+    place = np.zeros((6, count, 2))
+    delay = np.zeros(6)
     even[0], place[1, :, 0], place[2, :, 1], delay[5] = light / 100, x, y, late
     place[3], place[4] = (
         figures.turned(np.array([[0.0, 0.0, turn]]))[0],
@@ -595,15 +615,17 @@ def _of_drift(
 
 def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
     """The instrument, temperature, clock and prediction, as [certify] states them."""
-    certify, stars = file.config.certify, len(figures.stars)
-    one, instrument = np.ones((1, stars)), certify.instrument
+    certify = file.config.certify
+    stars = len(figures.stars)
+    ones = np.ones((1, stars))
+    instrument = certify.instrument
     if instrument.name:
         scale = instrument.relative_expanded / instrument.k
         source = (
             f"certificate of {instrument.name}{f', {instrument.date}' if instrument.date else ''},"
             f" k = {instrument.k:g}"
         )
-        yield Effect(Input("instrument", "normal", source, 1, scale, "relative"), even=scale * one)
+        yield Effect(Input("instrument", "normal", source, 1, scale, "relative"), even=scale * ones)
     else:
         missing.append(
             "absolute scale of the light: no [certify.instrument]; light is in the tracker's own"
@@ -612,14 +634,12 @@ def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
     yield from _of_tracker(file, figures, missing)
     if certify.temperature_k and (certify.flux_mag_per_k or certify.place_arcsec_per_k):
         kelvin = certify.temperature_k / math.sqrt(3)
-        flux, place = (
-            certify.flux_mag_per_k * kelvin / MAG_PER_RELATIVE,
-            certify.place_arcsec_per_k * kelvin,
-        )
+        flux = certify.flux_mag_per_k * kelvin / MAG_PER_RELATIVE
+        place = certify.place_arcsec_per_k * kelvin
         moved = np.zeros((3, stars, 2))
         moved[1, :, 0], moved[2, :, 1] = place, place
         source = f"[certify] temperature_k = {certify.temperature_k:g}, half of a range"
-        light = np.stack([flux * one[0], 0 * one[0], 0 * one[0]])
+        light = np.stack([flux * ones[0], 0 * ones[0], 0 * ones[0]])
         yield Effect(
             Input("temperature", "rectangular", source, 3, kelvin, "K"), even=light, place=moved
         )
@@ -642,8 +662,9 @@ def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterat
 
     Its errors of direction and of evenness are taken as smooth: correlated over half of its field.
     """
-    stated, count = file.config.certify.tracker, len(figures.stars)
-    of = ", ".join(each for each in (stated.name, stated.date) if each)
+    stated = file.config.certify.tracker
+    count = len(figures.stars)
+    of = ", ".join(source_part for source_part in (stated.name, stated.date) if source_part)
     source = f"[certify.tracker] {of or 'without a name'}, k = {stated.k:g}"
     tracker = geometry_of(file).tracker
     half = min(tracker.resolution_px) / 2 / tracker.focal_length_px

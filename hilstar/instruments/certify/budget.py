@@ -94,18 +94,21 @@ class BudgetTrials:
 
 def first_order(model: Model, inputs: list[Input]) -> Combined:
     """Combine the inputs by the slopes of the model."""
-    zeros = [np.zeros((1, each.size)) for each in inputs]
+    zeros = [np.zeros((1, budget_input.size)) for budget_input in inputs]
     value = model(zeros)[0]
     columns = []
-    for number, each in enumerate(inputs):
-        steps = STEP * np.concatenate([np.eye(each.size), -np.eye(each.size)])
+    for number, budget_input in enumerate(inputs):
+        steps = STEP * np.concatenate([np.eye(budget_input.size), -np.eye(budget_input.size)])
         moved = [np.zeros((len(steps), other.size)) for other in inputs]
         moved[number] = steps
         high, low = np.split(model(moved), 2)
         columns.append(np.sqrt((((high - low) / (2 * STEP)) ** 2).sum(axis=0)))
-    contribution = np.stack(columns, axis=1) if columns else np.zeros((len(value), 0))
+    if columns:
+        contribution = np.stack(columns, axis=1)
+    else:
+        contribution = np.zeros((len(value), 0))
     standard = np.sqrt((contribution**2).sum(axis=1))
-    finite = np.array([1 / each.dof for each in inputs])
+    finite = np.array([1 / budget_input.dof for budget_input in inputs])
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.minimum(
             np.nan_to_num(standard**4 / (contribution**4 @ finite), nan=MAX_DOF, posinf=MAX_DOF),
@@ -125,7 +128,7 @@ def by_trials(
     batches: list[FloatArray] = []
     settled = False
     while len(batches) * BATCH < max_trials and not settled:
-        figures = model([each.draw(BATCH, rng) for each in inputs])
+        figures = model([budget_input.draw(BATCH, rng) for budget_input in inputs])
         low, high = np.quantile(figures, tails, axis=0)
         batches.append(np.stack([figures.mean(axis=0), figures.std(axis=0, ddof=1), low, high]))
         if len(batches) > 1:
@@ -165,11 +168,10 @@ def why_they_differ(
         return (
             f"the largest input ({largest.name}) is {largest.distribution}, whose tails are short"
         )
-    few = [
-        each.name
-        for each, part in zip(inputs, share, strict=True)
-        if each.dof < FEW_DOF and part > FEW_SHARE
-    ]
+    few = []
+    for budget_input, part in zip(inputs, share, strict=True):
+        if budget_input.dof < FEW_DOF and part > FEW_SHARE:
+            few.append(budget_input.name)
     if few:
         return f"few readings ({', '.join(few)}): Welch-Satterthwaite's freedom is an approximation"
     return "the model is not linear over the inputs' range"

@@ -97,8 +97,14 @@ def certify(
 
     `warm_up` and `checked` are as in `assemble`. Raises InputError, MachineError.
     """
-    read = None if reader is None else read_bench(file, reader)
-    reference = None if reader is None else msgspec.json.encode(take_check(file, reader))
+    if reader is None:
+        read = None
+    else:
+        read = read_bench(file, reader)
+    if reader is None:
+        reference = None
+    else:
+        reference = msgspec.json.encode(take_check(file, reader))
     budget = assemble(file, read, warm_up, checked)
     combined = first_order(budget.model, budget.inputs)
     drawn = by_trials(
@@ -111,13 +117,14 @@ def certify(
     if reader is not None and reader.truth is not None:
         truth = budget.figures.of(true_deviations(budget.figures, reader.truth))[0]
     figures = _figures(file, budget, combined, drawn, truth)
-    judged = [each.conforms for each in figures if each.conforms is not None]
-    config, settings = file.config, file.config.certify
+    judged = [figure.conforms for figure in figures if figure.conforms is not None]
+    config = file.config
+    settings = file.config.certify
     files = files_of(file)
     made = now.astimezone(datetime.UTC).isoformat(timespec="seconds")
     core = msgspec.json.encode([file.sha256, files, made, figures])
     settings_of = msgspec.to_builtins(config.collimator) | {"file": config.collimator.geometry}
-    found = Certificate(
+    certificate = Certificate(
         kind=KIND,
         number=f"H{made[:10].replace('-', '')}-{sha256_of(core)[:8]}",
         made=made,
@@ -142,14 +149,14 @@ def certify(
         two_digits_stand=drawn.settled,
         inputs=[
             InputRow(
-                name=each.name,
-                distribution=each.distribution,
-                standard_uncertainty=_rounded(each.standard),
-                unit=each.unit,
-                dof=each.dof if math.isfinite(each.dof) else None,
-                source=each.source,
+                name=figure.name,
+                distribution=figure.distribution,
+                standard_uncertainty=_rounded(figure.standard),
+                unit=figure.unit,
+                dof=figure.dof if math.isfinite(figure.dof) else None,
+                source=figure.source,
             )
-            for each in budget.inputs
+            for figure in budget.inputs
         ],
         figures=figures,
         not_assessed=[*budget.not_assessed, *_never_assessed(settings)],
@@ -157,21 +164,21 @@ def certify(
         reference_sha256=None if reference is None else sha256_of(reference),
         replaces=replaces,
     )
-    return found, reference
+    return certificate, reference
 
 
 def _never_assessed(settings: CertifySettings) -> list[str]:
-    found = [
+    reasons = [
         "focus, stray light and the shape of stars: the figures are of their light and middle",
         "pixels that change each other's light: a star's is taken as the sum of its pixels, each as"
         " it is read among others of its code or of black",
     ]
-    found += [
+    reasons += [
         f"{what} is not written in [certify]"
         for what in ("who", "where", "ambient", "traceability")
         if not getattr(settings, what)
     ]
-    return found
+    return reasons
 
 
 def _figures(
@@ -181,8 +188,8 @@ def _figures(
     drawn: BudgetTrials,
     truth: np.ndarray[Any, Any] | None,
 ) -> list[CertifiedFigure]:
-    found, settings = [], file.config.certify
-    unknown = {each.partition(":")[0] for each in budget.not_assessed}
+    rows, settings = [], file.config.certify
+    unknown = {reason.partition(":")[0] for reason in budget.not_assessed}
     missing = {name for key, names in UNKNOWN.items() if key in unknown for name in names}
     for number, (quantity, which, unit) in enumerate(budget.names):
         if quantity in missing:
@@ -213,7 +220,7 @@ def _figures(
         nominal = file.config.monitor.panel_delay_ms if quantity == "latency" else 0.0
         ends = (value,) if settings.decision == "simple" else (lower[number], upper[number])
         dof = float(combined.dof[number])
-        found.append(
+        rows.append(
             CertifiedFigure(
                 quantity=quantity,
                 region=region,
@@ -251,7 +258,7 @@ def _figures(
                 ],
             )
         )
-    return found
+    return rows
 
 
 def _rounded(value: float) -> float:
@@ -261,7 +268,8 @@ def _rounded(value: float) -> float:
 
 def files_of(file: BenchFile) -> dict[str, str]:
     """The SHA-256 of a bench file and of each file that it names, by name."""
-    config, found = file.config, {file.path.name: sha256_of(file.text.encode())}
+    config = file.config
+    hashes = {file.path.name: sha256_of(file.text.encode())}
     named: list[str | float | None] = [
         config.monitor.calibration,
         config.collimator.geometry,
@@ -277,7 +285,7 @@ def files_of(file: BenchFile) -> dict[str, str]:
         if not isinstance(name, str) or name in BUILT_IN or not (file.folder / name).is_file():
             continue
         path = file.folder / name
-        found[name] = sha256_of(read_bytes(path, "", MAX_FILE_BYTES))
+        hashes[name] = sha256_of(read_bytes(path, "", MAX_FILE_BYTES))
         if path.suffix == ".toml":
             table = parse_toml(path, read_text(path, "", MAX_TOML_BYTES))
             for inner in (
@@ -285,10 +293,10 @@ def files_of(file: BenchFile) -> dict[str, str]:
                 table.get("uniformity", {}).get("file"),
             ):
                 if isinstance(inner, str) and (path.parent / inner).is_file():
-                    found[str(Path(name).parent / inner)] = sha256_of(
+                    hashes[str(Path(name).parent / inner)] = sha256_of(
                         read_bytes(path.parent / inner, "", MAX_FILE_BYTES)
                     )
-    return found
+    return hashes
 
 
 def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
@@ -296,11 +304,10 @@ def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
     the calibration files.
     """
     monitor = file.config.monitor
-    named = (
-        [now]
-        if now is not None
-        else [each.identity for each in measured_on(file) if each.identity is not None]
-    )
+    if now is not None:
+        named = [now]
+    else:
+        named = [origin.identity for origin in measured_on(file) if origin.identity is not None]
     return {
         "resolution_px": list(monitor.resolution_px),
         "refresh_hz": monitor.refresh_hz,

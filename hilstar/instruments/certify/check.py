@@ -105,7 +105,8 @@ def take_check(file: BenchFile, reader: Reader) -> CheckReadings:
     white = 2**file.config.monitor.bits - 1
     lit = np.unique(np.rint(np.geomspace(max(white * 0.06, 1), white, PATCHES - 1)).astype(np.intp))
     order = np.random.default_rng(PATCHES).permutation(np.repeat(np.append(0, lit), REPEATS))
-    light, dots = reader.light(order), reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
+    light = reader.light(order)
+    dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
     delays = reader.delays_ms()
     many = len(delays) > 1
     return CheckReadings(
@@ -152,12 +153,12 @@ def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[Che
     """The figures of a check against its reference. Raises InputError where they have too little
     in common.
     """
-    found = [*_light(was, now), *_geometry(file, was, now)]
+    changes = [*_light(was, now), *_geometry(file, was, now)]
     psf_u = 100 * math.hypot(was.psf_u_px, now.psf_u_px) / was.psf_px
-    found.append(("psf", 100 * (now.psf_px / was.psf_px - 1), psf_u, ALARMED_DOF, 0.0))
+    changes.append(("psf", 100 * (now.psf_px / was.psf_px - 1), psf_u, ALARMED_DOF, 0.0))
     if was.delay_ms is not None and now.delay_ms is not None:
         both = math.hypot(was.delay_u_ms, now.delay_u_ms)
-        found.append(
+        changes.append(
             (
                 "latency",
                 now.delay_ms - was.delay_ms,
@@ -166,8 +167,8 @@ def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[Che
                 0.0,
             )
         )
-    probability = FALSE_ALARM / len(found)
-    return [_judged(*each, probability) for each in found]
+    probability = FALSE_ALARM / len(changes)
+    return [_judged(*change, probability) for change in changes]
 
 
 def _judged(
@@ -180,12 +181,17 @@ def _judged(
     if free:  # a mean square of noise alone is u^2 times F's
         k = math.sqrt(fdtri(free, dof, 1 - probability))
         wide = u * math.sqrt(fdtri(free, dof, COVERAGE))
-        lower, upper = max(value - wide, 0.0), value + wide
+        lower = max(value - wide, 0.0)
+        upper = value + wide
     else:
         k = float(stdtrit(dof, 1 - probability / 2))
         wide = float(stdtrit(dof, (1 + COVERAGE) / 2)) * u
-        lower, upper = value - wide, value + wide
-    threshold = math.hypot(tolerance, k * u) if free else tolerance + k * u
+        lower = value - wide
+        upper = value + wide
+    if free:
+        threshold = math.hypot(tolerance, k * u)
+    else:
+        threshold = tolerance + k * u
     return CheckFigure(
         quantity,
         value,
@@ -208,7 +214,7 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
     light.
     """
     codes = np.unique(was.code)
-    sets = [(np.array(each.code), np.array(each.light)) for each in (was, now)]
+    sets = [(np.array(readings.code), np.array(readings.light)) for readings in (was, now)]
     if not np.array_equal(codes, np.unique(now.code)):
         raise InputError("the check's codes are not the certificate's; certify the bench --again")
     mean = np.array([[light[code == c].mean() for c in codes] for code, light in sets])
@@ -223,11 +229,12 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
     freedom = (count - 1)[used]
     bright = codes > codes[len(codes) // 3]
     dof = float(freedom[:, bright].sum())
-    relative = (
-        math.sqrt(float((squares[used][:, bright] / mean[used][:, bright] ** 2).sum()) / dof)
-        if dof
-        else 0.0
-    )
+    if dof:
+        relative = math.sqrt(
+            float((squares[used][:, bright] / mean[used][:, bright] ** 2).sum()) / dof
+        )
+    else:
+        relative = 0.0
     faint = np.arange(len(codes)) < FAINT
     floor = float(
         (squares[used] - freedom * (relative * mean[used]) ** 2)[:, faint].sum()
@@ -237,17 +244,19 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
         ((relative * mean[k]) ** 2 + max(floor, 0.0)) / count[k] for k in (0, 1) if used[k]
     )
     sigma = np.sqrt(variance)
-    lit, white = codes > 0, mean[0, -1]
-    change, error = mean[1, lit] / mean[0, lit] - 1, sigma[lit] / mean[0, lit]
+    lit = codes > 0
+    white = mean[0, -1]
+    change = mean[1, lit] / mean[0, lit] - 1
+    error = sigma[lit] / mean[0, lit]
     design = np.stack([np.ones(int(lit.sum())), np.log(codes[lit] / codes[-1])], axis=1)
     inverse = np.linalg.pinv(design / error[:, None]) / error
     covariance = (inverse * error**2) @ inverse.T
     slope = inverse @ change
     middle = float(np.average(np.log(codes[lit] / codes[-1]), weights=error**-2))
     at = np.array([1.0, middle])
-    left = (change - design @ slope) / error
-    free = len(left) - 2
-    rest = math.sqrt(float((left**2).mean()))
+    standardised = (change - design @ slope) / error
+    free = len(standardised) - 2
+    rest = math.sqrt(float((standardised**2).mean()))
     typical = 100 * math.sqrt(float(np.mean(error**2)))
     return [
         (
@@ -258,7 +267,13 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
             0.0,
         ),
         ("gamma", float(slope[1]), math.sqrt(float(covariance[1, 1])), dof, 0.0),
-        ("response_rest", rest * typical, typical * math.sqrt(free / len(left)), dof, float(free)),
+        (
+            "response_rest",
+            rest * typical,
+            typical * math.sqrt(free / len(standardised)),
+            dof,
+            float(free),
+        ),
         (
             "black",
             100 * float(mean[1, 0] - mean[0, 0]) / white,
@@ -274,13 +289,19 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
     have.
     """
     places = [
-        {(x, y): k for k, (x, y) in enumerate(zip(each.x_px, each.y_px, strict=True))}
-        for each in (was, now)
+        {(x, y): k for k, (x, y) in enumerate(zip(readings.x_px, readings.y_px, strict=True))}
+        for readings in (was, now)
     ]
     both = sorted(places[0].keys() & places[1].keys())
     dots = []
-    for each, place in zip((was, now), places, strict=True):
-        columns = (each.x_px, each.y_px, each.seen_x_px, each.seen_y_px, each.dot_light)
+    for readings, place in zip((was, now), places, strict=True):
+        columns = (
+            readings.x_px,
+            readings.y_px,
+            readings.seen_x_px,
+            readings.seen_y_px,
+            readings.dot_light,
+        )
         x, y, seen_x, seen_y, light_of = np.array(columns)[:, [place[at] for at in both]]
         dots.append(DotReadings(x, y, seen_x, seen_y, light_of))
     if len(both) < 4 * len(TOLERANCES):
@@ -291,24 +312,26 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
     size = file.config.monitor.resolution_px
     moved = place_errors(file, dots[1]) - place_errors(file, dots[0])
     rays = geometry_of(file).monitor.rays(dots[0].x_px, dots[0].y_px)
-    u, v = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    one, none = np.ones_like(u), np.zeros_like(u)
+    u = rays[:, 0] / rays[:, 2]
+    v = rays[:, 1] / rays[:, 2]
+    ones = np.ones_like(u)
+    none = np.zeros_like(u)
     design = np.concatenate(
-        [np.stack([one, none, u, -v], axis=1), np.stack([none, one, v, u], axis=1)]
+        [np.stack([ones, none, u, -v], axis=1), np.stack([none, ones, v, u], axis=1)]
     )
     values = moved.T.ravel()
-    kept = np.isfinite(values)
+    is_kept = np.isfinite(values)
     for _ in range(3):
-        inverse = np.linalg.pinv(design[kept])
-        found = inverse @ values[kept]
-        left = values - design @ found
-        kept = np.isfinite(values) & (
-            np.abs(left) < 6 * 1.4826 * max(float(np.median(np.abs(left[kept]))), 1e-9)
+        inverse = np.linalg.pinv(design[is_kept])
+        solution = inverse @ values[is_kept]
+        residual = values - design @ solution
+        is_kept = np.isfinite(values) & (
+            np.abs(residual) < 6 * 1.4826 * max(float(np.median(np.abs(residual[is_kept]))), 1e-9)
         )
     rest = surface(
         dots[0].x_px,
         dots[0].y_px,
-        np.where(kept, left, np.nan).reshape(2, -1).T,
+        np.where(is_kept, residual, np.nan).reshape(2, -1).T,
         REST_DEGREES,
         size,
     )
@@ -321,7 +344,8 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
         ratio = np.log(dots[1].light / dots[0].light)
     light = surface(dots[0].x_px, dots[0].y_px, ratio[:, None], REST_DEGREES, size)
     even = light.terms(dots[0].x_px, dots[0].y_px) @ light.value[:, 0]
-    n, count = float(len(both)), float(terms.shape[1])
+    n = float(len(both))
+    count = float(terms.shape[1])
     return [
         (
             "evenness",
@@ -330,10 +354,10 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[F
             light.dof,
             count - 1,
         ),
-        ("scale", ppm * float(found[2]), ppm * float(error[2]), rest.dof, 0.0),
-        ("rotation", float(found[3]), float(error[3]), rest.dof, 0.0),
-        ("shift_x", float(found[0]), float(error[0]), rest.dof, 0.0),
-        ("shift_y", float(found[1]), float(error[1]), rest.dof, 0.0),
+        ("scale", ppm * float(solution[2]), ppm * float(error[2]), rest.dof, 0.0),
+        ("rotation", float(solution[3]), float(error[3]), rest.dof, 0.0),
+        ("shift_x", float(solution[0]), float(error[0]), rest.dof, 0.0),
+        ("shift_y", float(solution[1]), float(error[1]), rest.dof, 0.0),
         (
             "geometry_rest",
             float(np.sqrt((fitted**2).mean())),
@@ -359,8 +383,8 @@ def record(
             raise InputError(f"{path}: its columns are not {', '.join(columns)}; move it away")
     stamp = made.isoformat(timespec="milliseconds")  # two checks of one second are two
     rows += [
-        {"made": stamp, "certificate": since, **{k: str(v) for k, v in asdict(each).items()}}
-        for each in figures
+        {"made": stamp, "certificate": since, **{k: str(v) for k, v in asdict(figure).items()}}
+        for figure in figures
     ]
     write_csv(path, columns, ([row[name] for name in columns] for row in rows))
     draw_checks(folder / CHART, rows)
@@ -372,8 +396,11 @@ def draw_checks(path: Path, rows: list[dict[str, str]]) -> None:
     first = datetime.datetime.fromisoformat(rows[0]["made"])
     out = sorted({row["quantity"] for row in rows if row["in_tolerance"] != "True"})
     number = len({row["made"] for row in rows})
-    told = f"out of tolerance in {', '.join(out)}" if out else "all within tolerance"
-    finding = f"{number} check{'s' if number > 1 else ''}: {told}"
+    if out:
+        tolerance_text = f"out of tolerance in {', '.join(out)}"
+    else:
+        tolerance_text = "all within tolerance"
+    finding = f"{number} check{'s' if number > 1 else ''}: {tolerance_text}"
     with chart(path, finding, panels=len(DRAWN)) as panels:
         for axes, (quantity, label) in zip(panels, DRAWN, strict=True):
             mine = [row for row in rows if row["quantity"] == quantity]
@@ -396,7 +423,9 @@ def draw_checks(path: Path, rows: list[dict[str, str]]) -> None:
 def checks_in(folder: Path) -> int:
     """How many rows of checks a directory has."""
     path = folder / CHECKS
-    return read_text(path, "", MAX_BYTES).count("\n") if exists(path) else 0
+    if exists(path):
+        return read_text(path, "", MAX_BYTES).count("\n")
+    return 0
 
 
 def largest_changes(folder: Path) -> dict[str, float] | None:
@@ -406,15 +435,17 @@ def largest_changes(folder: Path) -> dict[str, float] | None:
     path = folder / CHECKS
     if not exists(path):
         return None
-    found: dict[str, float] = {}
+    changes: dict[str, float] = {}
     try:
         for row in csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))):
-            found[row["quantity"]] = max(abs(float(row["value"])), found.get(row["quantity"], 0.0))
+            changes[row["quantity"]] = max(
+                abs(float(row["value"])), changes.get(row["quantity"], 0.0)
+            )
     except (KeyError, ValueError) as error:
         raise InputError(
             f"{path}: is no table of checks ({shortened(error)}); move it away"
         ) from error
-    return found or None
+    return changes or None
 
 
 def watch(reader: Reader, white: int, longest_min: float, path: Path) -> WarmUp:
@@ -426,9 +457,9 @@ def watch(reader: Reader, white: int, longest_min: float, path: Path) -> WarmUp:
         return float(reader.light(np.array([white], dtype=np.intp)).light[0])
 
     t_s, light = watch_white(read, reader.now_ns, reader.wait, longest_min * 60)
-    found = judge_warm_up(t_s, light)
-    with chart(path, found.line) as (axes,):
+    judged = judge_warm_up(t_s, light)
+    with chart(path, judged.line) as (axes,):
         axes.plot(t_s / 60, light / light[-1], "o", color=BLUE, ms=3)
-        axes.plot(t_s / 60, fitted_white(found, t_s, light) / light[-1], color=ORANGE)
+        axes.plot(t_s / 60, fitted_white(judged, t_s, light) / light[-1], color=ORANGE)
         axes.set(xlabel="time [min]", ylabel="white over its last reading")
-    return found
+    return judged

@@ -111,8 +111,10 @@ class LightDeviation:
         inner = np.flatnonzero((step[1:] < MAX_ROUGH_STEP) & (step[:-1] < MAX_ROUGH_STEP)) + 1
         if len(inner) < MIN_ROUGH_CODES:
             return np.zeros(len(log_light))
-        own = np.concatenate([self.factors, self.dark_factors, self.lasting_factors], axis=1)
-        noise = ((gaps @ own) ** 2).sum(axis=1)[inner]
+        own_factors = np.concatenate(
+            [self.factors, self.dark_factors, self.lasting_factors], axis=1
+        )
+        noise = ((gaps @ own_factors) ** 2).sum(axis=1)[inner]
         off = (gaps @ self.value)[inner] ** 2
         if fdtrc(len(inner), self.dof, float((off / noise).mean())) > ROUGH_P:
             return np.zeros(len(log_light))
@@ -166,14 +168,16 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     for _ in range(3):
         sigma = np.hypot(noise * by_shape, max(floor, 1e-9 * mean[-1] * noise))
         inverse = np.linalg.pinv(design / sigma[:, None])
-        left = read.light - design @ (found := inverse @ (read.light / sigma))
-        own = 1 - np.einsum("ij,ji->i", design / sigma[:, None], inverse)
+        residual = read.light - design @ (solution := inverse @ (read.light / sigma))
+        freedom = 1 - np.einsum("ij,ji->i", design / sigma[:, None], inverse)
         noise = math.sqrt(
-            float(((left / np.maximum(by_shape, 1e-300))[bright] ** 2).sum())
-            / max(float(own[bright].sum()), 1e-9)
+            float(((residual / np.maximum(by_shape, 1e-300))[bright] ** 2).sum())
+            / max(float(freedom[bright].sum()), 1e-9)
         )
-        floor = math.sqrt(float((left[dark] ** 2).sum()) / max(float(own[dark].sum()), 1e-9))
-    if own[bright].sum() < MIN_DOF / 2 or own[dark].sum() < MIN_DOF / 2:
+        floor = math.sqrt(
+            float((residual[dark] ** 2).sum()) / max(float(freedom[dark].sum()), 1e-9)
+        )
+    if freedom[bright].sum() < MIN_DOF / 2 or freedom[dark].sum() < MIN_DOF / 2:
         raise InputError(
             "white and black are read too seldom to know their scatter; read both three times or"
             " more"
@@ -182,14 +186,17 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         inverse * part / sigma for part in (noise * by_shape, np.full(len(lit), floor))
     )
     when = np.asarray(hours if timed else np.arange(len(read.code)), dtype=np.float64)
-    lasting = in_time(when, left / sigma, design / sigma[:, None])
+    lasting = in_time(when, residual / sigma, design / sigma[:, None])
     # What is correlated is no noise of a reading by itself.
     alone = math.sqrt(lasting.noise_variance) if lasting.total else 1.0
     by_light, by_dark = alone * by_light, alone * by_dark
     lasts = inverse @ lasting_root(when, lasting)
-    light, size = found[1 : len(codes)] - found[0], len(codes)
+    light, size = solution[1 : len(codes)] - solution[0], len(codes)
     lost = math.hypot(
-        *(float(np.linalg.norm(each[size - 1] - each[0])) for each in (by_light, by_dark))
+        *(
+            float(np.linalg.norm(factor_rows[size - 1] - factor_rows[0]))
+            for factor_rows in (by_light, by_dark)
+        )
     )
     if not light[-1] > FAINT_SIGMAS * lost:
         raise InputError(
@@ -206,16 +213,18 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     )
     common = np.zeros((len(codes), 0))
     if read.common is not None:
-        common = np.stack([np.bincount(place, each) / count for each in read.common.T], axis=1)
+        common = np.stack(
+            [np.bincount(place, factor_rows) / count for factor_rows in read.common.T], axis=1
+        )
     expected = white_of(file) * here * grey.light[codes[1:]]
     return LightDeviation(
         log_light=np.log(grey.light[codes[1:]]),
         value=light / expected,
         factors=(by_light[1:size] - by_light[0]) / expected[:, None],
-        dof=float(own[bright].sum()),
+        dof=float(freedom[bright].sum()),
         noise=noise,
         dark_factors=(by_dark[1:size] - by_dark[0]) / expected[:, None],
-        dark_dof=float(own[dark].sum()),
+        dark_dof=float(freedom[dark].sum()),
         dark=float(floor / light[-1]),
         lasting_factors=(lasts[1:size] - lasts[0]) / expected[:, None],
         lasting=lasting,
@@ -283,15 +292,15 @@ def surface(
         for _ in range(3):
             terms = field_terms(x_px, y_px, resolution_px, degree)
             q, r = np.linalg.qr(terms[kept])
-            found = np.linalg.solve(r, q.T @ values[kept])
-            left = np.abs(values - terms @ found)
-            spread = MAD_TO_SIGMA * np.median(left[kept], axis=0)
-            within = kept & (left < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
+            solution = np.linalg.solve(r, q.T @ values[kept])
+            residual = np.abs(values - terms @ solution)
+            spread = MAD_TO_SIGMA * np.median(residual[kept], axis=0)
+            within = kept & (residual < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
             if within.sum() == kept.sum():
                 break
             kept = within
         dof = (int(kept.sum()) - count) * values.shape[1]
-        squares = float((left[kept] ** 2).sum())
+        squares = float((residual[kept] ** 2).sum())
         if best is not None:
             more = best.dof - dof
             if (
@@ -304,10 +313,8 @@ def surface(
                 break
         noise = math.sqrt(squares / dof)
         # r'r is the normal matrix, so its inverse's root is that of r.
-        best, best_squares = (
-            Surface(degree, resolution_px, found, noise * np.linalg.inv(r), float(dof), noise),
-            squares,
-        )
+        best = Surface(degree, resolution_px, solution, noise * np.linalg.inv(r), float(dof), noise)
+        best_squares = squares
     if best is None:
         needed = DOTS_A_TERM * (degrees[0] + 1) * (degrees[0] + 2) // 2
         raise InputError(
@@ -322,9 +329,11 @@ def place_errors(file: BenchFile, read: DotReadings) -> FloatArray:
     x and y.
     """
     geometry = geometry_of(file)
-    seen = geometry.tracker.rays(read.seen_x_px, read.seen_y_px)
+    seen_rays = geometry.tracker.rays(read.seen_x_px, read.seen_y_px)
     shown = geometry.monitor.rays(read.x_px, read.y_px)
-    return np.asarray((seen[:, :2] / seen[:, 2:] - shown[:, :2] / shown[:, 2:]) * ARCSEC_PER_RAD)
+    return np.asarray(
+        (seen_rays[:, :2] / seen_rays[:, 2:] - shown[:, :2] / shown[:, 2:]) * ARCSEC_PER_RAD
+    )
 
 
 def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
@@ -334,19 +343,23 @@ def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
     size = file.config.monitor.resolution_px
     known = bench_calibration(file.config, file.folder).uniformity_map(size)
     at = np.rint(read.y_px).astype(np.intp), np.rint(read.x_px).astype(np.intp)
-    expected = np.ones(len(read.x_px)) if known is None else known[at].astype(np.float64)
+    if known is None:
+        expected = np.ones(len(read.x_px))
+    else:
+        expected = known[at].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.log(read.light / expected)
     fit = surface(read.x_px, read.y_px, off[:, None], EVEN_DEGREES, size)
-    left = off - (fit.terms(read.x_px, read.y_px) @ fit.value)[:, 0]
-    kept = np.isfinite(left)
-    kept &= np.abs(left) <= WILD_SIGMAS * max(
-        MAD_TO_SIGMA * float(np.median(np.abs(left[kept]))), 1e-12
+    residual = off - (fit.terms(read.x_px, read.y_px) @ fit.value)[:, 0]
+    is_kept = np.isfinite(residual)
+    is_kept &= np.abs(residual) <= WILD_SIGMAS * max(
+        MAD_TO_SIGMA * float(np.median(np.abs(residual[is_kept]))), 1e-12
     )
-    x, y = read.x_px[kept], read.y_px[kept]
+    x = read.x_px[is_kept]
+    y = read.y_px[is_kept]
     terms = fit.terms(x, y)
-    found = in_place(x, y, left[None, kept], terms[None])
-    return Evenness(fit, Cells(x, y), np.asarray(np.linalg.pinv(terms)), found)
+    structure = in_place(x, y, residual[None, is_kept], terms[None])
+    return Evenness(fit, Cells(x, y), np.asarray(np.linalg.pinv(terms)), structure)
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,7 +388,9 @@ class Evenness:
             eigen, rows, columns = self.cells.basis(length)
             turned = self.cells.turned(rows, columns, weights.T)
             crossed = shares @ self.cells.towards(x_px, y_px, length) @ weights.T
-            own = shares @ np.exp(-apart / (2 * length**2)) @ shares.T
-            covariance += variance * (own - crossed - crossed.T + (turned.T * eigen) @ turned)
+            own_covariance = shares @ np.exp(-apart / (2 * length**2)) @ shares.T
+            covariance += variance * (
+                own_covariance - crossed - crossed.T + (turned.T * eigen) @ turned
+            )
         size, vectors = np.linalg.eigh(covariance)
         return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0))).T)

@@ -95,8 +95,8 @@ class LensFit:
                 turned = self.cells.turned(rows, columns, axis)
                 covariance += variance * (turned.T * eigen) @ turned
         size, vectors = np.linalg.eigh(covariance)
-        kept = size > SAME * max(float(size.max()), TINY)
-        return np.asarray(vectors[:, kept] * np.sqrt(size[kept]))
+        is_independent = size > SAME * max(float(size.max()), TINY)
+        return np.asarray(vectors[:, is_independent] * np.sqrt(size[is_independent]))
 
 
 def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFit:
@@ -104,45 +104,52 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     arcsec.
     """
     geometry = geometry_of(file)
-    kept: BoolArray = np.asarray(np.isfinite(seen_off).all(axis=1))
+    is_kept: BoolArray = np.asarray(np.isfinite(seen_off).all(axis=1))
     monitor = geometry.monitor
     flat = Camera(
         monitor.resolution_px, monitor.focal_length_px, monitor.principal_point_px, np.eye(3), None
     )
     rays = monitor.rays(read.x_px, read.y_px)
     wanted = rays[:, :2] / rays[:, 2:]
-    found = _fitted(geometry, flat, wanted, read, kept)
-    left = seen_off - (_tangents(found.geometry.monitor, flat, wanted) - wanted) * ARCSEC_PER_RAD
+    found = _fitted(geometry, flat, wanted, read, is_kept)
+    residual = (
+        seen_off - (_tangents(found.geometry.monitor, flat, wanted) - wanted) * ARCSEC_PER_RAD
+    )
     for _ in range(3):
         # About the polynomials, too: the lens alone may be off by more than noise, and a dot that
         # it misses is not wild.
         rough = field_terms(read.x_px, read.y_px, monitor.resolution_px, DEGREES[0])
-        off = left - rough @ np.linalg.lstsq(rough[kept], left[kept], rcond=None)[0]
-        spread = MAD_TO_SIGMA * np.median(np.abs(off[kept]), axis=0)
-        within = kept & (np.abs(off) < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
-        if within.sum() == kept.sum():
+        off = residual - rough @ np.linalg.lstsq(rough[is_kept], residual[is_kept], rcond=None)[0]
+        spread = MAD_TO_SIGMA * np.median(np.abs(off[is_kept]), axis=0)
+        within = is_kept & (np.abs(off) < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
+        if within.sum() == is_kept.sum():
             break
-        kept = within
-    x, y = read.x_px[kept], read.y_px[kept]
+        is_kept = within
+    x = read.x_px[is_kept]
+    y = read.y_px[is_kept]
     # Where the fit shows the dots: waves at the places as read would hold each dot's own noise, and
     # fit it.
-    shown_px = geometry.tracker.places_px(*_tangents(found.geometry.monitor, flat, wanted[kept]).T)
+    shown_px = geometry.tracker.places_px(
+        *_tangents(found.geometry.monitor, flat, wanted[is_kept]).T
+    )
     phases = _phases(*shown_px)
     fit = None
     for degree in (0, *DEGREES):
-        terms = np.concatenate([_terms(found, flat, wanted[kept], (x, y), degree), phases], axis=2)
+        terms = np.concatenate(
+            [_terms(found, flat, wanted[is_kept], (x, y), degree), phases], axis=2
+        )
         scale = np.maximum(np.linalg.norm(terms.reshape(2 * len(x), -1), axis=0), TINY)
         vectors, size, across = np.linalg.svd(
             terms.reshape(2 * len(x), -1) / scale, full_matrices=False
         )
-        told = size > SAME * size[0]
-        own = vectors[:, told]
-        coefficients = own.T @ left[kept].T.ravel()
-        rest = (left[kept].T.ravel() - own @ coefficients).reshape(2, -1)
-        basis = own.reshape(2, len(x), -1)
+        is_told = size > SAME * size[0]
+        own_vectors = vectors[:, is_told]
+        coefficients = own_vectors.T @ residual[is_kept].T.ravel()
+        rest = (residual[is_kept].T.ravel() - own_vectors @ coefficients).reshape(2, -1)
+        basis = own_vectors.reshape(2, len(x), -1)
         structure = in_place(x, y, rest, basis)
-        mix = across[told].T / size[told] / scale[:, None]
-        dof = float(2 * len(x) - told.sum())
+        mix = across[is_told].T / size[is_told] / scale[:, None]
+        dof = float(2 * len(x) - is_told.sum())
         fit = LensFit(
             geometry, flat, found, degree, mix, coefficients, basis, Cells(x, y), structure, dof
         )
@@ -158,9 +165,9 @@ def _phases(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """What the pattern of the tracker's pixels does to centroids (2, n, 4): waves of one pixel,
     along each axis by itself.
     """
-    waves = [
-        np.stack([np.sin(2 * np.pi * at), np.cos(2 * np.pi * at)], axis=1) for at in (x_px, y_px)
-    ]
+    waves = []
+    for at in (x_px, y_px):
+        waves.append(np.stack([np.sin(2 * np.pi * at), np.cos(2 * np.pi * at)], axis=1))
     nothing = np.zeros_like(waves[0])
     return np.stack([np.hstack([waves[0], nothing]), np.hstack([nothing, waves[1]])])
 
@@ -173,13 +180,13 @@ def _fitted(
     count = len(x)
     none = np.zeros(count, dtype=np.intp)
     plan = DotPlan(x, y, np.ones((count, 1), dtype=bool))
-    seen = Observed(none, none, read.seen_x_px[kept], read.seen_y_px[kept], np.ones(count))
+    observed = Observed(none, none, read.seen_x_px[kept], read.seen_y_px[kept], np.ones(count))
     still = np.array([[1.0, 0.0, 0.0, 0.0]])
     problem = fits.Problem(
         plan, fits.Nominal(flat, still[0], geometry.tracker), still, EXPECTED_NOISE_PX
     )
     return fits.fit(
-        problem, fits.Model(fits.BROWN_CONRADY), 0, fits.MatchedDots(seen, np.arange(count))
+        problem, fits.Model(fits.BROWN_CONRADY), 0, fits.MatchedDots(observed, np.arange(count))
     )
 
 
@@ -230,6 +237,6 @@ def _decentring(wanted: FloatArray) -> FloatArray:
     """
     round_ = (wanted**2).sum(axis=1) / HALF_TANGENT**2
     place = wanted.T / HALF_TANGENT
-    along = [round_ * place * each for each in place]
+    along = [round_ * place * axis_place for axis_place in place]
     across = [np.stack([round_**2, 0 * round_]), np.stack([0 * round_, round_**2])]
     return np.stack([*along, *across], axis=2)

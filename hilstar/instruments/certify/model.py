@@ -90,26 +90,36 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
 def _of_field(
     bench: Bench, frame: Frame, number: int, geometry: BenchGeometry
 ) -> list[ReferenceStar]:
-    truth, sigma = frame.rows, max(bench.psf.width_px)
+    truth = frame.rows
+    sigma = max(bench.psf.width_px)
     vectors = bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T
-    x, y = truth["x_px"].astype(np.float64), truth["y_px"].astype(np.float64)
+    x = truth["x_px"].astype(np.float64)
+    y = truth["y_px"].astype(np.float64)
     places = np.nan_to_num(np.stack([x, y], axis=1), nan=-1e6)
     near = cKDTree(places).query_ball_point(places, ALONE_SIGMAS * sigma, return_length=True)
     reach, (width, height) = math.ceil(REACH_SIGMAS * sigma), bench.camera.resolution_px
-    kept = truth["drawn"] & ~truth["clipped"] & (near == 1) & (bench.stars.row[frame.star] >= 0)
-    kept &= _seen(geometry, x, y)
-    kept &= (x > reach + 1) & (x < width - 2 - reach) & (y > reach + 1) & (y < height - 2 - reach)
-    third, shown, found = thirds(geometry, x), shown_light(frame.levels, bench.panel), []
-    for each in range(len(THIRDS)):
-        here = np.flatnonzero(kept & (third == each))  # the brightest first
+    is_usable = (
+        truth["drawn"] & ~truth["clipped"] & (near == 1) & (bench.stars.row[frame.star] >= 0)
+    )
+    is_usable &= _seen(geometry, x, y)
+    is_usable &= (
+        (x > reach + 1) & (x < width - 2 - reach) & (y > reach + 1) & (y < height - 2 - reach)
+    )
+    third = thirds(geometry, x)
+    shown = shown_light(frame.levels, bench.panel)
+    stars = []
+    for third_number in range(len(THIRDS)):
+        here = np.flatnonzero(is_usable & (third == third_number))  # the brightest first
         for k in (
             here[np.unique(np.linspace(0, len(here) - 1, STARS_A_THIRD).astype(int))]
             if len(here)
             else []
         ):
             rows, columns = (slice(round(at) - reach, round(at) + reach + 1) for at in (y[k], x[k]))
-            light, level = shown[rows, columns].ravel(), frame.levels[rows, columns].ravel()
-            wanted, lit = float(frame.linear[rows, columns].sum(dtype=np.float64)), light > 0
+            light = shown[rows, columns].ravel()
+            level = frame.levels[rows, columns].ravel()
+            wanted = float(frame.linear[rows, columns].sum(dtype=np.float64))
+            lit = light > 0
             if not lit.any() or wanted <= 0:
                 continue
             star = ReferenceStar(
@@ -118,7 +128,7 @@ def _of_field(
                 v_mag=float(truth["v_mag"][k]),
                 b_v_mag=float(truth["bv"][k]),
                 field=number,
-                third=each,
+                third=third_number,
                 x_px=float(x[k]),
                 y_px=float(y[k]),
                 direction=vectors[k],
@@ -126,8 +136,8 @@ def _of_field(
                 log_light=np.log(bench.calibration.response.light[level[lit]]),
                 share=light[lit] / light[lit].sum(),
             )
-            found.append(star)
-    return found
+            stars.append(star)
+    return stars
 
 
 def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -140,10 +150,10 @@ def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> FloatA
 def thirds(geometry: BenchGeometry, x_px: FloatArray) -> IntArray:
     """The third (n,) of what the tracker sees of the screen, 0 at the left, by columns."""
     along, down = geometry.monitor.grid_px((181, 61))
-    seen = along[_seen(geometry, along, down)]
+    visible_along = along[_seen(geometry, along, down)]
     low, high = (
-        (float(seen.min()), float(seen.max()))
-        if len(seen)
+        (float(visible_along.min()), float(visible_along.max()))
+        if len(visible_along)
         else (0.0, float(geometry.monitor.resolution_px[0]))
     )
     return np.asarray(np.clip((x_px - low) / max(high - low, 1.0) * 3, 0, 2).astype(np.intp))
@@ -172,7 +182,8 @@ class Figures:
     """
 
     def __init__(self, file: BenchFile, stars: list[ReferenceStar]) -> None:
-        self.stars, self.file = stars, file
+        self.stars = stars
+        self.file = file
         self.log_light, place = np.unique(
             np.concatenate([star.log_light for star in stars]), return_inverse=True
         )
@@ -190,9 +201,11 @@ class Figures:
         self._of_field = [
             np.flatnonzero(fields == number) for number in range(int(fields.max()) + 1)
         ]
-        each = [("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec")]
+        star_quantities = [("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec")]
         self.names = [
-            (quantity, star, unit) for quantity, unit in each for star in range(len(stars))
+            (quantity, star, unit)
+            for quantity, unit in star_quantities
+            for star in range(len(stars))
         ]
         axes = [("attitude_x", "arcsec"), ("attitude_y", "arcsec"), ("attitude_z", "arcsec")]
         self.names += [
@@ -214,7 +227,8 @@ class Figures:
         """The figures (b, figures): flux mag (fainter is positive), places arcsec, attitudes
         arcsec, latency ms.
         """
-        certify, monitor = self.file.config.certify, self.file.config.monitor
+        certify = self.file.config.certify
+        monitor = self.file.config.monitor
         flux = (
             magnitude(np.maximum(off.levels @ self._shares.T, NO_LIGHT))
             - MAG_PER_RELATIVE * off.even
@@ -232,12 +246,12 @@ class Figures:
         """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported
         attitude.
         """
-        seen = np.ones((len(place_arcsec), len(stars), 3))
-        seen[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
-        seen /= np.linalg.norm(seen, axis=2, keepdims=True)
-        left, _, right = np.linalg.svd(np.einsum("bsi,sj->bij", seen, self._direction[stars]))
-        left[..., 2] *= np.linalg.det(left @ right)[:, None]
-        turn = left @ right
+        rays = np.ones((len(place_arcsec), len(stars), 3))
+        rays[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        u, _, right = np.linalg.svd(np.einsum("bsi,sj->bij", rays, self._direction[stars]))
+        u[..., 2] *= np.linalg.det(u @ right)[:, None]
+        turn = u @ right
         # The axial vector of a rotation by an angle a is 2 sin(a) times its axis.
         axial = np.stack(
             [
@@ -260,7 +274,8 @@ class Figures:
 def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
     """The deviations of a bench whose truth is known (b = 1), at its reference stars."""
     file = figures.file
-    mine, its = grey_response(file), grey_response(truth)
+    mine = grey_response(file)
+    its = grey_response(truth)
     levels = np.interp(figures.log_light, np.log(mine.light[1:]), its.light[1:] / mine.light[1:])
     levels *= white_of(truth) / white_of(file)
     even = np.zeros(len(figures.stars))
@@ -271,7 +286,8 @@ def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
         size_px = bench.config.monitor.resolution_px
         known = bench_calibration(bench.config, bench.folder).uniformity_map(size_px)
         if known is not None:
-            row, column = np.rint(y_px).astype(np.intp), np.rint(x_px).astype(np.intp)
+            row = np.rint(y_px).astype(np.intp)
+            column = np.rint(x_px).astype(np.intp)
             even += sign * np.log(known[row, column].astype(np.float64))
         rays.append(geometry_of(bench).monitor.rays(x_px, y_px))
     shown, wanted = rays

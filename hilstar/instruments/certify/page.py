@@ -87,7 +87,7 @@ def words_of(quantity: str) -> str:
 
 def _verdict(found: Certificate) -> Verdict:
     state, headline = VERDICTS[found.conforms]
-    judged = [each.conforms for each in found.figures if each.conforms is not None]
+    judged = [figure.conforms for figure in found.figures if figure.conforms is not None]
     missed = judged.count(False)
     if missed:
         headline = f"{headline}: {missed} of {len(judged)} figures"
@@ -97,7 +97,7 @@ def _verdict(found: Certificate) -> Verdict:
 def _first(found: Certificate) -> Iterator[KeyFigure]:
     """The worst figure of each kind that a user asks for first."""
     for quantity in FIRST:
-        members = [each for each in found.figures if each.quantity == quantity]
+        members = [figure for figure in found.figures if figure.quantity == quantity]
         if members:
             worst = max(members, key=_size)
             yield KeyFigure(_value(worst), f"{words_of(quantity)}, worst of {len(members)}")
@@ -125,10 +125,9 @@ def _cards(found: Certificate, digest: str) -> Iterator[Card]:
     yield Card("Identity", words=[table_of(identity)])
     files = [(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()]
     yield Card("Files", words=[table_of(files, ("file", "SHA-256"))])
-    rows = [
-        (words_of(figure.quantity), figure.region, figure.star, _value(figure))
-        for figure in found.figures
-    ]
+    rows = []
+    for figure in found.figures:
+        rows.append((words_of(figure.quantity), figure.region, figure.star, _value(figure)))
     table = table_of(rows, ALL_COLUMNS)
     texts = [details_of(f"{len(found.figures)} figures", table, printed=True)]
     yield Card("All figures", words=texts)
@@ -154,28 +153,38 @@ def _figures(found: Certificate) -> Card:
 def _budget(found: Certificate) -> Card:
     """What the uncertainties are made of."""
     bars = [_bars(found, quantity) for quantity in BARS]
-    rows = [
-        (each.name, each.distribution, each.standard_uncertainty, each.unit, each.dof, each.source)
-        for each in found.inputs
-    ]
+    rows = []
+    for budget_input in found.inputs:
+        rows.append(
+            (
+                budget_input.name,
+                budget_input.distribution,
+                budget_input.standard_uncertainty,
+                budget_input.unit,
+                budget_input.dof,
+                budget_input.source,
+            )
+        )
     return Card("Budget", words=[*bars, table_of(rows, INPUT_COLUMNS, TWO_DIGITS)])
 
 
 def statement(found: Certificate) -> str:
     """The statement of uncertainty, in a sentence or two."""
     parts = []
-    for quantity, words in (
+    for quantity, quantity_text in (
         ("flux", "a star's flux"),
         ("place_along", "its place"),
         ("attitude_x", "attitude across"),
     ):
         half = [
-            (each.upper - each.lower) / 2 for each in found.figures if each.quantity == quantity
+            (figure.upper - figure.lower) / 2
+            for figure in found.figures
+            if figure.quantity == quantity
         ]
-        unit = next((each.unit for each in found.figures if each.quantity == quantity), "")
+        unit = next((figure.unit for figure in found.figures if figure.quantity == quantity), "")
         if half:
-            parts.append(f"{words} {np.sqrt(np.mean(np.square(half))):.2g} {unit}")
-    late = next((each for each in found.figures if each.quantity == "latency"), None)
+            parts.append(f"{quantity_text} {np.sqrt(np.mean(np.square(half))):.2g} {unit}")
+    late = next((figure for figure in found.figures if figure.quantity == "latency"), None)
     parts += [f"latency {(late.upper - late.lower) / 2:.2g} ms"] if late else []
     return (
         "Expanded uncertainty (95 %), rms over the reference stars:"
@@ -203,9 +212,9 @@ def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, ...]]:
 
 def _worst(found: Certificate) -> Iterator[tuple[object, ...]]:
     groups: dict[tuple[str, str], list[CertifiedFigure]] = defaultdict(list)
-    for each in found.figures:
-        if each.quantity in SHOWN or each.quantity.startswith("star_"):
-            groups[each.quantity, each.region].append(each)
+    for figure in found.figures:
+        if figure.quantity in SHOWN or figure.quantity.startswith("star_"):
+            groups[figure.quantity, figure.region].append(figure)
     for (quantity, region), members in groups.items():
         worst = max(members, key=_size)
         limit = None
@@ -216,7 +225,7 @@ def _worst(found: Certificate) -> Iterator[tuple[object, ...]]:
 
 def _judged(members: list[CertifiedFigure]) -> str | None:
     """The verdict on figures of a kind and region; None without limits."""
-    judged = [each.conforms for each in members if each.conforms is not None]
+    judged = [figure.conforms for figure in members if figure.conforms is not None]
     if not judged:
         return None
     if all(judged):
@@ -227,14 +236,15 @@ def _judged(members: list[CertifiedFigure]) -> str | None:
 def _bars(found: Certificate, quantity: str) -> str:
     """The contributions to a kind of figure, rms over all of its figures, ranked."""
     squares: dict[str, float] = defaultdict(float)
-    members = [each for each in found.figures if each.quantity == quantity]
-    for each in members:
-        for part in each.contributions:
+    members = [figure for figure in found.figures if figure.quantity == quantity]
+    for figure in members:
+        for part in figure.contributions:
             squares[part.input] += part.standard_uncertainty**2 / len(members)
     ranked = sorted(squares.items(), key=lambda item: -item[1])[:MAX_BARS]
     if not ranked:
         return ""
-    total, unit = np.sqrt(sum(squares.values())), members[0].unit
+    total = np.sqrt(sum(squares.values()))
+    unit = members[0].unit
     finding = (
         f"{words_of(quantity)}: {total:.2g} {unit} standard uncertainty, of which {ranked[0][0]}"
         f" {np.sqrt(ranked[0][1]):.2g}"
@@ -252,29 +262,28 @@ def _bars(found: Certificate, quantity: str) -> str:
 
 def _both_ways(found: Certificate) -> Iterator[str]:
     both = [
-        each
-        for each in found.figures
-        if each.by_trials is not None and each.standard_uncertainty > 0
+        figure
+        for figure in found.figures
+        if figure.by_trials is not None and figure.standard_uncertainty > 0
     ]
     if not both:
         return
     ratio = np.array(
         [
-            each.by_trials.standard_uncertainty / each.standard_uncertainty
-            for each in both
-            if each.by_trials
+            figure.by_trials.standard_uncertainty / figure.standard_uncertainty
+            for figure in both
+            if figure.by_trials
         ]
     )
-    stand = (
-        "two digits of every figure stand"
-        if found.two_digits_stand
-        else "the largest number of trials was reached"
-    )
+    if found.two_digits_stand:
+        stand = "two digits of every figure stand"
+    else:
+        stand = "the largest number of trials was reached"
     yield (
         f"<p>{found.trials} trials of the whole model ({stand}): their standard uncertainty is"
         f" {ratio.min():.3f} to {ratio.max():.3f} of first order's.</p>"
     )
-    apart = [each for each in both if each.by_trials and each.by_trials.differs]
+    apart = [figure for figure in both if figure.by_trials and figure.by_trials.differs]
     rows = [
         (words_of(e.quantity), e.star or e.region,
          e.value - e.k * e.standard_uncertainty, e.value + e.k * e.standard_uncertainty,
@@ -309,14 +318,17 @@ def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str,
                 quantity in ("flux", "place_along", "place_across")
             ):
                 continue
-            each = max(members, key=lambda e: max(abs(e.lower), abs(e.upper)))
-            half = (each.upper - each.lower) / 2
+            widest = max(members, key=lambda e: max(abs(e.lower), abs(e.upper)))
+            half = (widest.upper - widest.lower) / 2
             # two digits of the uncertainty
-            places = max(1 - math.floor(math.log10(half)), 0) if half > 0 else 4
-            value = f"{round(each.value, places) + 0.0:+.{places}f}"
-            text = f"{value} +- {half:.{places}f} {each.unit} (the worst of {len(members)})"
+            if half > 0:
+                places = max(1 - math.floor(math.log10(half)), 0)
+            else:
+                places = 4
+            value = f"{round(widest.value, places) + 0.0:+.{places}f}"
+            text = f"{value} +- {half:.{places}f} {widest.unit} (the worst of {len(members)})"
             lines.append((f"{quantity} {region or ''}".strip(), text))
-    lines += [("not assessed", each) for each in found.not_assessed]
+    lines += [("not assessed", widest) for widest in found.not_assessed]
     return [
         *lines,
         ("valid until", found.valid_until),

@@ -94,11 +94,13 @@ def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
     """
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     width, height = geometry.monitor.resolution_px
-    seen = math.prod(
+    seen_share = math.prod(
         min(ratio * s, t)
         for s, t in zip((width, height), geometry.tracker.resolution_px, strict=True)
     )
-    step = max(math.ceil(max(APART_TRACKER_PX, math.sqrt(seen / MAX_DOTS)) / ratio), 2 * DOT_PX)
+    step = max(
+        math.ceil(max(APART_TRACKER_PX, math.sqrt(seen_share / MAX_DOTS)) / ratio), 2 * DOT_PX
+    )
     x, y = (
         part.ravel()
         for part in np.meshgrid(
@@ -145,9 +147,12 @@ class VirtualReader:
                 f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar"
                 " first-light)"
             )
-        self.file, self.truth, self._rng = file, truth, np.random.default_rng((seed, 0xCE27, turn))
+        self.file = file
+        self.truth = truth
+        self._rng = np.random.default_rng((seed, 0xCE27, turn))
         self.identity = f"virtual: {truth.path.name}, sha256 {truth.sha256}, seed {seed}"
-        self._noise, self._t_s = truth.config.certify.virtual, 0.0
+        self._noise = truth.config.certify.virtual
+        self._t_s = 0.0
         monitor = truth.config.monitor
         self._response = grey_response(truth)
         self._uniformity = bench_calibration(truth.config, truth.folder).uniformity_map(
@@ -165,11 +170,15 @@ class VirtualReader:
 
     def light(self, codes: IntArray) -> LightReadings:
         """The truth's light at the middle of the screen, with drift and noise."""
-        noise, rng = self._noise, self._rng
+        noise = self._noise
+        rng = self._rng
         t_s = self._t_s + noise.seconds_a_reading * np.arange(len(codes), dtype=np.float64)
         self._t_s += noise.seconds_a_reading * len(codes)
         width, height = self.truth.config.monitor.resolution_px
-        here = 1.0 if self._uniformity is None else float(self._uniformity[height // 2, width // 2])
+        if self._uniformity is None:
+            here = 1.0
+        else:
+            here = float(self._uniformity[height // 2, width // 2])
         warmth = 1 + noise.drift_percent_per_h / 100 * t_s / 3600
         cold = noise.cold_percent / 100 * np.exp(-t_s / (60 * noise.warm_up_min))
         scale = self._white_e_per_s * here * (1 + noise.instrument_error) * (warmth - cold)
@@ -179,20 +188,22 @@ class VirtualReader:
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """The dots' places by the truth's lens, with noise."""
-        x, y = x_px.astype(np.float64), y_px.astype(np.float64)
+        x = x_px.astype(np.float64)
+        y = y_px.astype(np.float64)
         true_x, true_y = in_true_image(self.file, self.truth, x, y)
         less = 1 / math.sqrt(images)
-        seen = geometry_of(self.truth).to_tracker(true_x, true_y)
+        seen_px = geometry_of(self.truth).to_tracker(true_x, true_y)
         light = np.ones(len(x))
         if self._uniformity is not None:
-            row, column = true_y.astype(np.intp), true_x.astype(np.intp)
+            row = true_y.astype(np.intp)
+            column = true_x.astype(np.intp)
             light = self._uniformity[row, column].astype(np.float64)
         light *= 1 + less * self._noise.reading_noise * self._rng.standard_normal(len(x))
         seen_x, seen_y = (
             part + less * self._noise.dot_noise_px * self._rng.standard_normal(len(x))
-            for part in seen
+            for part in seen_px
         )
-        kept = np.isfinite(seen_x) & np.isfinite(seen_y)
+        is_visible = np.isfinite(seen_x) & np.isfinite(seen_y)
         psf_u = less * self._noise.reading_noise
         psf = float(
             np.hypot(*tracker_psf(self.truth.config.tracker, self.truth.folder).width_px)
@@ -200,7 +211,13 @@ class VirtualReader:
         )
         noisy = psf * (1 + psf_u * float(self._rng.standard_normal()))
         return DotReadings(
-            x[kept], y[kept], seen_x[kept], seen_y[kept], light[kept], noisy, psf * psf_u
+            x[is_visible],
+            y[is_visible],
+            seen_x[is_visible],
+            seen_y[is_visible],
+            light[is_visible],
+            noisy,
+            psf * psf_u,
         )
 
     def delays_ms(self) -> FloatArray:
@@ -220,7 +237,8 @@ def in_true_image(
     A screen can be stated in several ways: flipped both ways it is turned by 180 degrees, and
     turned by nearly 45 degrees it may be taken for a quarter turn.
     """
-    mine, its = file.config.monitor, truth.config.monitor
+    mine = file.config.monitor
+    its = truth.config.monitor
     on_screen = orientation_of(mine).to_screen(x_px, y_px, mine.resolution_px)
     return orientation_of(its).to_image(*on_screen, its.resolution_px)
 
@@ -234,7 +252,7 @@ def _is_mounted_alike(file: BenchFile, truth: BenchFile) -> bool:
     y_px = np.array([0.0, 0.0, STEP_PX]) + (height - 1) / 2
     stated = np.stack(geometry_of(file).to_tracker(x_px, y_px))
     true = np.stack(geometry_of(truth).to_tracker(*in_true_image(file, truth, x_px, y_px)))
-    steps, true_steps = (each[:, 1:] - each[:, :1] for each in (stated, true))
+    steps, true_steps = (poses[:, 1:] - poses[:, :1] for poses in (stated, true))
     lengths = np.linalg.norm(steps, axis=0) * np.linalg.norm(true_steps, axis=0)
     cosines = (steps * true_steps).sum(axis=0) / lengths
     return bool((cosines > math.cos(math.pi / 4)).all())
@@ -303,52 +321,56 @@ class ImageReader:
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """One image of dots, each found near where the bench file has it."""
-        context, geometry = self._context, geometry_of(self.file)
+        context = self._context
+        geometry = geometry_of(self.file)
         code = code_of_light(self.file, DOT_LIGHT)
         dark = context.read(context.dark())
         while True:
-            codes, half = image_sources.black(context.resolution_px), DOT_PX // 2
+            codes = image_sources.black(context.resolution_px)
+            half = DOT_PX // 2
             for down in range(-half, half + 1):
                 for right in range(-half, half + 1):
                     codes[y_px + down, x_px + right] = code
-            looked = [
-                context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark)
-                for number in range(images)
-            ]
+            looked = []
+            for number in range(images):
+                looked.append(
+                    context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark)
+                )
             if not context.is_too_bright(looked[0]):
                 break
             code = context.darker(code)
-        image = np.mean([each.image for each in looked], axis=0)
-        found = find_stars(image, dot_settings(self.file), noisiest_background(image))
+        image = np.mean([look.image for look in looked], axis=0)
+        stars = find_stars(image, dot_settings(self.file), noisiest_background(image))
         from scipy.spatial import cKDTree
 
-        x, y = x_px.astype(np.float64), y_px.astype(np.float64)
+        x = x_px.astype(np.float64)
+        y = y_px.astype(np.float64)
         expected = np.stack(geometry.to_tracker(x, y), axis=1)
-        if len(found) < MIN_DOTS:
+        if len(stars) < MIN_DOTS:
             raise InputError(
-                f"{len(found)} dots are in the image and {MIN_DOTS} are needed; look at the focus"
+                f"{len(stars)} dots are in the image and {MIN_DOTS} are needed; look at the focus"
                 " and the exposure"
             )
         far, near = (
             np.asarray(part)
-            for part in cKDTree(np.stack([found.x_px, found.y_px], axis=1)).query(expected)
+            for part in cKDTree(np.stack([stars.x_px, stars.y_px], axis=1)).query(expected)
         )
-        kept = (far < APART_TRACKER_PX / 2) & ~found.at_edge[near]
+        kept = (far < APART_TRACKER_PX / 2) & ~stars.at_edge[near]
         if kept.sum() < MIN_DOTS:
             raise InputError(
                 f"{int(kept.sum())} dots are where the bench file has them; run the geometry again"
                 " (first-light)"
             )
-        seen = SeenScreen(
+        seen_screen = SeenScreen(
             geometry.monitor,
             geometry.tracker,
             is_sure=True,
             psf_sigma_px=psf_sigma_of(self._context.file),
         )
-        sharp = seen_sharpness(image, seen, self.file.config.tracker.detector, len(looked))
+        sharp = seen_sharpness(image, seen_screen, self.file.config.tracker.detector, len(looked))
         at = near[kept]
-        places = x[kept], y[kept], found.x_px[at], found.y_px[at]
-        return DotReadings(*places, found.flux[at], sharp.psf_sigma_px, sharp.psf_sigma_error_px)
+        places = x[kept], y[kept], stars.x_px[at], stars.y_px[at]
+        return DotReadings(*places, stars.flux[at], sharp.psf_sigma_px, sharp.psf_sigma_error_px)
 
     def delays_ms(self) -> FloatArray:
         """The photodiode's edges, where there is one."""

@@ -85,7 +85,7 @@ def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> St
             weight = 1 / (1 + ratio * eigen)
             normal = spread.terms.T @ (weight[:, None] * spread.terms)
             towards = spread.terms.T @ (weight * spread.value)
-            left = (
+            unexplained = (
                 float(
                     spread.value @ (weight * spread.value)
                     - towards @ np.linalg.solve(normal, towards)
@@ -93,8 +93,8 @@ def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> St
                 + spread.square
             )
             sizes = float(np.linalg.slogdet(normal)[1] - np.log(weight).sum())
-            likelihood[row, column] = -0.5 * (sizes + dof * math.log(max(left, TINY)))
-            noise[row, column] = left / dof
+            likelihood[row, column] = -0.5 * (sizes + dof * math.log(max(unexplained, TINY)))
+            noise[row, column] = unexplained / dof
     finer = _finer(lengths, FINE_LENGTH), _finer(RATIOS, FINE_RATIO)
     of_some = _between(lengths, likelihood[:, 1:], finer)
     noise_of_some = np.exp(_between(lengths, np.log(np.maximum(noise[:, 1:], TINY)), finer))
@@ -108,10 +108,10 @@ def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> St
     share /= share.sum()
     # As of a variance by few readings, whose Student's t has the geometric mean for its scale,
     # nearly.
-    each = noise_of_some * finer[1]
-    middle = float((share * np.log(each)).sum())
-    dof = max(2 / max(float((share * (np.log(each) - middle) ** 2).sum()), TINY), MIN_DOF)
-    variance = (share * each).sum(axis=1)
+    evidence = noise_of_some * finer[1]
+    middle = float((share * np.log(evidence)).sum())
+    dof = max(2 / max(float((share * (np.log(evidence) - middle) ** 2).sum()), TINY), MIN_DOF)
+    variance = (share * evidence).sum(axis=1)
     return Structure(
         finer[0],
         variance * math.exp(middle) / variance.sum(),
@@ -172,7 +172,10 @@ class Cells:
         index = np.zeros(len(x_px), dtype=np.intp)
         for at in (y_px, x_px):
             places = np.unique(at)
-            step = float(np.median(np.diff(places))) if len(places) > 1 else 1.0
+            if len(places) > 1:
+                step = float(np.median(np.diff(places)))
+            else:
+                step = 1.0
             number = np.rint((at - places[0]) / step).astype(np.intp) // group
             count = int(number.max()) + 1
             self.middle.append(places[0] + step * (group * np.arange(count) + (group - 1) / 2))
@@ -187,7 +190,8 @@ class Cells:
 
     def lengths(self) -> FloatArray:
         """Lengths that the lattice can tell, px: from half of a cell to half of its extent."""
-        low, high = min(self.side) / 2, max(float(np.ptp(each)) for each in self.middle) / 2
+        low = min(self.side) / 2
+        high = max(float(np.ptp(middles)) for middles in self.middle) / 2
         return np.asarray(
             np.geomspace(low, high, max(round(math.log(high / low) / math.log(LENGTH_STEP)) + 1, 2))
         )
@@ -237,14 +241,16 @@ def in_place(
     n, p) common to all axes.
     """
     inside = _rectangle(x_px, y_px)
-    cells, values, terms = Cells(x_px[inside], y_px[inside]), values[:, inside], terms[:, inside]
-    means = [cells.means(each) for each in values]
-    of_terms = [cells.means(each) for each in terms]
+    cells = Cells(x_px[inside], y_px[inside])
+    values = values[:, inside]
+    terms = terms[:, inside]
+    means = [cells.means(column) for column in values]
+    of_terms = [cells.means(column) for column in terms]
     scale = math.sqrt(cells.typical)
     within = float(
         sum(
-            ((each - mean[cells.index]) ** 2).sum()
-            for each, mean in zip(values, means, strict=True)
+            ((column - mean[cells.index]) ** 2).sum()
+            for column, mean in zip(values, means, strict=True)
         )
     )
     free = float(len(values) * (len(cells.index) - (cells.count > 0).sum()))
@@ -255,13 +261,15 @@ def in_place(
     spreads = []
     for length in (lengths := cells.lengths()):
         eigen, rows, columns = cells.basis(length)
-        own = cells.turned(rows, columns, hidden)
-        blank = np.zeros_like(own)
-        value = [scale * cells.turned(rows, columns, each[:, None])[:, 0] for each in means]
+        own_turned = cells.turned(rows, columns, hidden)
+        blank = np.zeros_like(own_turned)
+        value = [scale * cells.turned(rows, columns, column[:, None])[:, 0] for column in means]
         term = []
-        for axis, each in enumerate(of_terms):
-            alone = [own if other == axis else blank for other in range(len(means))]
-            term.append(np.concatenate([scale * cells.turned(rows, columns, each), *alone], axis=1))
+        for axis, column in enumerate(of_terms):
+            alone = [own_turned if other == axis else blank for other in range(len(means))]
+            term.append(
+                np.concatenate([scale * cells.turned(rows, columns, column), *alone], axis=1)
+            )
         basis = np.linalg.qr(np.concatenate(term))[0]
         eigens = np.tile(cells.typical * eigen, len(means))
         spreads.append((eigens, Spread(np.concatenate(value), basis, within, free)))
@@ -274,7 +282,8 @@ def _rectangle(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
     """
     cells = Cells(x_px, y_px)
     filled = cells.filled.reshape(len(cells.middle[0]), len(cells.middle[1]))
-    low, high = [0, 0], list(filled.shape)
+    low = [0, 0]
+    high = list(filled.shape)
     while (
         not (part := filled[low[0] : high[0], low[1] : high[1]]).mean() > ENOUGH
         and part.size > MIN_CELLS

@@ -80,14 +80,18 @@ def compare(
     same = images[0].ndim == images[1].ndim
     light, golden_light = (image if same else _together(image) for image in images)
     check_skies(light, golden_light)
-    own = frame.truth if isinstance(frame, Frame) else None
+    truth_table = frame.truth if isinstance(frame, Frame) else None
     if isinstance(truth, str | Path):
         truth = read_truth_csv(Path(truth))
     elif truth is None and isinstance(golden, Frame):
         truth = golden.truth
-    elif truth is None and own is not None and describes(own, _together(golden_light)):
-        truth = own
-    return compare_skies(light, golden_light, Limits(flux_mag, centroid_px), truth, own)
+    elif (
+        truth is None
+        and truth_table is not None
+        and describes(truth_table, _together(golden_light))
+    ):
+        truth = truth_table
+    return compare_skies(light, golden_light, Limits(flux_mag, centroid_px), truth, truth_table)
 
 
 def _together(image: FloatArray) -> FloatArray:
@@ -97,11 +101,10 @@ def _together(image: FloatArray) -> FloatArray:
 def _image(sky: Sky) -> FloatArray:
     if isinstance(sky, str | Path):
         return read_frame_fits(Path(sky))
-    image = (
-        (sky.light if len(sky.light) > 1 else sky.linear)
-        if isinstance(sky, Frame)
-        else np.asarray(sky)
-    )
+    if isinstance(sky, Frame):
+        image = sky.light if len(sky.light) > 1 else sky.linear
+    else:
+        image = np.asarray(sky)
     if image.dtype.kind != "f":
         raise InputError(
             f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float),"

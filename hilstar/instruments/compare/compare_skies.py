@@ -64,9 +64,13 @@ def compare_skies(
     if frame.ndim == 3:
         tables = truth, frame_truth
         pairs = zip(CHANNELS, frame, golden, strict=True)
-        each = {name: compare_skies(one, other, limits, *tables) for name, one, other in pairs}
+        by_channel = {
+            name: compare_skies(golden_channel, other, limits, *tables)
+            for name, golden_channel, other in pairs
+        }
         return replace(
-            compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables), channels=each
+            compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables),
+            channels=by_channel,
         )
     psf = star_fit.star_psf(golden)
     seeds, unmeasured = _measurable(golden, star_fit.find_seeds(golden, truth, psf), psf)
@@ -77,7 +81,8 @@ def compare_skies(
     fit = _SkyFit(golden, seeds.places_px, psf)
     moved = fit.follow(frame)
     stars = _differences(seeds, fit, moved, limits)
-    more, less = moved.residual - fit.residual, fit.residual - moved.residual
+    more = moved.residual - fit.residual
+    less = fit.residual - moved.residual
     for light, table, error in (
         (less, truth, math.inf),
         (more, truth if frame_truth is None else frame_truth, -math.inf),
@@ -124,7 +129,8 @@ def _measurable(golden: FloatArray, seeds: star_fit.Seeds, psf: Psf) -> tuple[st
     """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many
     stars do not.
     """
-    count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
+    count = seeds.stars
+    shape = (golden.shape[0], golden.shape[1])
     seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
     seeds = star_fit.Seeds(star_fit.refined(golden, seeds.places_px, psf), seeds.hip)
     seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
@@ -222,7 +228,8 @@ def read_frame_fits(path: Path) -> FloatArray:
     data = read_bytes(path, wanted, MAX_FITS_BYTES)
     try:
         fits_image = read_fits_image(unpacked(data, MAX_FITS_BYTES))
-        image, header = fits_image.pixels, fits_image.header
+        image = fits_image.pixels
+        header = fits_image.header
     except (InputError, ImageSizeError) as error:
         raise InputError(f"{path}: {error}; {wanted}") from error
     except Exception as error:  # astropy raises whatever a broken header causes in its layers

@@ -76,10 +76,10 @@ COLUMNS = (
 
 def draw(path: Path, comparison: SkyComparison) -> Any:
     """Write the chart, and return its figure. Raises InputError where that fails."""
-    said = finding(comparison)
-    while title_lines(said).count("\n") > 1 and ";" in said:
-        said = said.rpartition(";")[0]
-    with chart(path, said, 2, height_inch=7.4) as axes:
+    title = finding(comparison)
+    while title_lines(title).count("\n") > 1 and ";" in title:
+        title = title.rpartition(";")[0]
+    with chart(path, title, 2, height_inch=7.4) as axes:
         names: list[list[Annotation]] = []
         for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "place error", "px")):
             panel = ChartPanel(comparison, unit)
@@ -93,13 +93,15 @@ def draw(path: Path, comparison: SkyComparison) -> Any:
         if (figure := axes[0].get_figure(root=True)) is not None:
             figure.draw_without_rendering()
         for texts in names:  # worst first, of each panel
-            kept: list[Bbox] = []
+            drawn_boxes: list[Bbox] = []
             for text in texts:
                 box = text.get_window_extent().padded(ROOM_PX)
-                if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
+                if len(drawn_boxes) == MAX_NAMES or any(
+                    box.overlaps(other) for other in drawn_boxes
+                ):
                     text.remove()
                 else:
-                    kept.append(box)
+                    drawn_boxes.append(box)
     return axes[0].figure
 
 
@@ -108,7 +110,8 @@ class ChartPanel:
 
     def __init__(self, comparison: SkyComparison, unit: str) -> None:
         common = comparison.common
-        self.unit, self.comparison = unit, comparison
+        self.unit = unit
+        self.comparison = comparison
         self.stars = comparison.stars if common is None else common.beyond + common.alone
         self.worst = comparison.differing
         self.brightest = max(star.flux_e_per_s for star in comparison.stars)
@@ -140,7 +143,10 @@ class ChartPanel:
         """How many stars are of a kind. Missing and extra ones are all counted, as on the
         terminal and in the table.
         """
-        count = len(self.comparison.of(kind)) if kind in self.rows else drawn
+        if kind in self.rows:
+            count = len(self.comparison.of(kind))
+        else:
+            count = drawn
         common = count - drawn
         return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
 
@@ -148,7 +154,10 @@ class ChartPanel:
         """Draw the stars, the limits and the legend."""
         for kind, marker, colour in STYLES:
             mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
-            heights = [self.rows[kind]] * len(mags) if kind in self.rows else errors
+            if kind in self.rows:
+                heights = [self.rows[kind]] * len(mags)
+            else:
+                heights = errors
             axis.plot(
                 mags,
                 heights,
@@ -179,9 +188,12 @@ class ChartPanel:
         """Names of the worst stars. Missing and extra ones are named in the panel of flux alone."""
         names = []
         for star in self.worst:
-            mag, error, own = self.point(star)
-            if self.unit == "mag" if star.kind in self.rows else error > own:
-                name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
+            mag, error, own_limit = self.point(star)
+            if self.unit == "mag" if star.kind in self.rows else error > own_limit:
+                if star.hip:
+                    name = star.name
+                else:
+                    name = f"({star.x_px:.0f}, {star.y_px:.0f})"
                 place = mag, self.rows.get(star.kind, error)
                 names.append(
                     axis.annotate(
@@ -228,7 +240,8 @@ def _figures(comparison: SkyComparison) -> Iterator[KeyFigure]:
     """How many stars there are, how far they are off at 95 %, and what only one image has."""
     limits = comparison.limits
     yield KeyFigure(str(comparison.star_count), "stars compared")
-    flux, place = comparison.flux_error_mag.p95, comparison.centroid_error_px.p95
+    flux = comparison.flux_error_mag.p95
+    place = comparison.centroid_error_px.p95
     yield _error(flux, "mag", f"flux error at 95 %; limit {limits.flux_mag:g} mag")
     yield _error(place, "px", f"place error at 95 %; limit {limits.centroid_px:g} px")
     for kind in ("missing", "extra"):

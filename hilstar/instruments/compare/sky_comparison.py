@@ -45,33 +45,42 @@ def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) 
     """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the
     middle; None for none.
     """
-    before, limit = np.hypot(*moves.T), np.median(limits_px)
+    before = np.hypot(*moves.T)
+    limit = np.median(limits_px)
     if np.median(before) <= limit:
         return None
     best: Motion | None = None
-    left = before
+    remaining = before
     for rank in range(1, rank_for(len(places)) + 1):
         motion = fitted_motion(places, moves, rank)
         then = np.hypot(*(moves - motion(places)).T)
-        more = (then <= limits_px).mean() > (left <= limits_px).mean() + MORE_STARS
-        nearer = np.median(left) > limit and np.median(then) < MIN_SHARE * np.median(left)
+        more = (then <= limits_px).mean() > (remaining <= limits_px).mean() + MORE_STARS
+        nearer = np.median(remaining) > limit and np.median(then) < MIN_SHARE * np.median(remaining)
         if rank == 1 or more or nearer:
-            best, left = motion, then
-    return best if np.median(left) <= MIN_SHARE * np.median(before) else None
+            best = motion
+            remaining = then
+    if np.median(remaining) <= MIN_SHARE * np.median(before):
+        return best
+    return None
 
 
 def rank_for(stars: int) -> int:
     """The rank of the richest motion that `stars` stars determine: 1 a shift, 2 with turn and
     scale, 3 a homography.
     """
-    return 3 if stars >= 16 else 2 if stars >= 6 else 1
+    if stars >= 16:
+        return 3
+    if stars >= 6:
+        return 2
+    return 1
 
 
 def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
     """The motion of a rank that has the minimum sum of absolute residuals."""
     scale = float(np.abs(places).max()) or 1.0
     (x, y), (u, v) = (places / scale).T, ((places + moves) / scale).T
-    ones, zeros = np.ones_like(x), np.zeros_like(x)
+    ones = np.ones_like(x)
+    zeros = np.zeros_like(x)
     if rank == 1:
         columns = [(ones, zeros), (zeros, ones)]
     elif rank == 2:
@@ -106,15 +115,16 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
 
 def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> FloatArray:
     """Coefficients (k,) of design (n, 2, k) to wanted (n, 2) with the minimum sum of distances."""
-    weight, found = np.ones(len(wanted)), np.zeros(design.shape[2])
+    weight = np.ones(len(wanted))
+    solution = np.zeros(design.shape[2])
     for _ in range(ROUNDS):
         root = np.sqrt(weight)[:, None]
         weighted = (design * root[..., None]).reshape(-1, design.shape[2])
-        found = np.asarray(
+        solution = np.asarray(
             np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64
         )
-        weight = 1 / np.maximum(np.hypot(*(wanted - design @ found).T), finest)
-    return np.asarray(found)
+        weight = 1 / np.maximum(np.hypot(*(wanted - design @ solution).T), finest)
+    return np.asarray(solution)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +172,9 @@ class StarDifference:
         """What became of the star."""
         if math.isinf(self.flux_error_mag):
             return "missing" if self.flux_error_mag > 0 else "extra"
-        return "same" if self.error_over_limit <= 1 else "changed"
+        if self.error_over_limit <= 1:
+            return "same"
+        return "changed"
 
     @property
     def error_over_limit(self) -> float:
@@ -177,11 +189,15 @@ class StarDifference:
         """Its HIP number, those of its blend, or its place."""
         if self.hip:
             hips, bodies = (
-                [one for one in self.hip if isinstance(one, kind)] for kind in (int, str)
+                [designation for designation in self.hip if isinstance(designation, kind)]
+                for kind in (int, str)
             )
             return " + ".join(
                 [
-                    *(f"HIP {one}" if k == 0 else str(one) for k, one in enumerate(hips)),
+                    *(
+                        f"HIP {designation}" if k == 0 else str(designation)
+                        for k, designation in enumerate(hips)
+                    ),
                     *map(str, bodies),
                 ]
             )
@@ -189,7 +205,10 @@ class StarDifference:
 
     def line(self) -> str:
         """What is wrong with the star, for a person."""
-        place = f" at ({self.x_px:.2f}, {self.y_px:.2f}) px" if self.hip else ""
+        if self.hip:
+            place = f" at ({self.x_px:.2f}, {self.y_px:.2f}) px"
+        else:
+            place = ""
         if self.kind in ("missing", "extra"):
             return f"{self.name}{place}: {self.kind}, {self.flux_e_per_s:.4g} electrons/s"
         return (
@@ -224,27 +243,23 @@ class CommonChange:
         """What is common, for a person."""
         right, down = self.shift_px
         digits = 2 if math.hypot(right, down) >= 0.1 else 4
-        found = (
-            [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"]
-            if any(self.shift_px)
-            else []
-        )
-        found += [f"turned by {self.rotation_deg:+.4f} deg"] if self.rotation_deg else []
-        found += [f"scaled by {self.scale_error:+.4%}"] if self.scale_error else []
-        dimmer, digits = (
-            "dimmer" if self.flux_mag > 0 else "brighter",
-            2 if abs(self.flux_mag) >= 0.1 else 4,
-        )
-        found += [f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag"] if self.flux_mag else []
+        if any(self.shift_px):
+            parts = [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"]
+        else:
+            parts = []
+        parts += [f"turned by {self.rotation_deg:+.4f} deg"] if self.rotation_deg else []
+        parts += [f"scaled by {self.scale_error:+.4%}"] if self.scale_error else []
+        dimmer = "dimmer" if self.flux_mag > 0 else "brighter"
+        digits = 2 if abs(self.flux_mag) >= 0.1 else 4
+        parts += [f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag"] if self.flux_mag else []
         odd = len(self.differing)
-        rest = (
-            ""
-            if not odd
-            else "; 1 star differs from that"
-            if odd == 1
-            else f"; {odd} stars differ from that"
-        )
-        return f"all {', '.join(found) or 'moved alike'}{rest}"
+        if not odd:
+            rest = ""
+        elif odd == 1:
+            rest = "; 1 star differs from that"
+        else:
+            rest = f"; {odd} stars differ from that"
+        return f"all {', '.join(parts) or 'moved alike'}{rest}"
 
     def summary(self) -> dict[str, Any]:
         """The figures as JSON has them."""
@@ -268,7 +283,8 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     )
     pairs = dict(_pairs(missing, extra))
     for here, there in pairs.items():  # stars that moved far are in both images
-        old, new = missing[here], extra[there]
+        old = missing[here]
+        new = extra[there]
         error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
         both.append(
             replace(
@@ -301,38 +317,45 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     alone = [star for k, star in enumerate(missing) if k not in pairs]
     taken = set(pairs.values())
     alone += [star for k, star in enumerate(extra) if k not in taken]
-    left = []
+    unmoved = []
     for star in alone:  # but those that the motion brought into view or took out of it
         place = _places([star]) - middle
-        move = model(place) if star.kind == "missing" else -model(place)
+        if star.kind == "missing":
+            move = model(place)
+        else:
+            move = -model(place)
         if not move.any() or (np.abs(place + move) <= middle - EDGE_PX).all():
-            left.append(star)
+            unmoved.append(star)
     # The motion in the middle, and its turn and scale there: 0 for what moves no star by more than
     # its limit.
-    limit, reach = float(np.median(limit_px)), float(np.hypot(*middle))
+    limit = float(np.median(limit_px))
+    reach = float(np.hypot(*middle))
     shift, right, down = model(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     (xx, yx), (xy, yy) = right - shift, down - shift
-    turn, grow = math.atan2(yx - xy, 2 + xx + yy), math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
+    turn = math.atan2(yx - xy, 2 + xx + yy)
+    grow = math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
     return CommonChange(
         (float(shift[0]), float(shift[1])) if np.hypot(*shift) > limit else (0.0, 0.0),
         math.degrees(turn) if abs(turn) * reach > limit else 0.0,
         grow if abs(grow) * reach > limit else 0.0,
         flux_mag,
         beyond,
-        left,
+        unmoved,
     )
 
 
 def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[tuple[int, int]]:
     """Which missing star is which extra one, by one common motion; none where they have none."""
-    old, new = _places(missing), _places(extra)
+    old = _places(missing)
+    new = _places(extra)
     voters = min(MAX_VOTERS, len(old), len(new))
     if voters < MIN_STARS:
         return []
-    brightest = [
-        np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS]
-        for kind in (missing, extra)
-    ]
+    brightest = []
+    for kind in (missing, extra):
+        brightest.append(
+            np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS]
+        )
     votes = (new[brightest[1]][None, :] - old[brightest[0]][:, None]).reshape(-1, 2)
     near = cKDTree(votes).query_ball_point(votes, VOTE_PX)
     winner = max(near, key=len)
@@ -342,7 +365,7 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
     pairs: list[tuple[int, int]] = []
     for _ in range(PAIR_ROUNDS):
         # Those that are each other's nearest, within PAIR_PX.
-        distance, nearest = (np.asarray(found) for found in cKDTree(new).query(predicted))
+        distance, nearest = (np.asarray(neighbours) for neighbours in cKDTree(new).query(predicted))
         back = np.asarray(cKDTree(predicted).query(new)[1])
         pairs = [
             (k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k
@@ -393,12 +416,14 @@ class SkyComparison:
         """The stars that are beyond their limits once the common difference is subtracted, worst
         first.
         """
-        return self.bad if self.common is None else _worst_first(self.common.differing)
+        if self.common is None:
+            return self.bad
+        return _worst_first(self.common.differing)
 
     @property
     def same(self) -> bool:
         """Whether both images are one sky, in every channel."""
-        return not self.bad and all(one.same for one in self.channels.values())
+        return not self.bad and all(channel.same for channel in self.channels.values())
 
     @property
     def star_count(self) -> int:
@@ -452,8 +477,10 @@ class SkyComparison:
             ],
             "same": self.same,
             "channels": {
-                name: {key: value for key, value in one.summary().items() if key in CHANNEL_KEYS}
-                for name, one in self.channels.items()
+                name: {
+                    key: value for key, value in channel.summary().items() if key in CHANNEL_KEYS
+                }
+                for name, channel in self.channels.items()
             },
         }
 
@@ -466,12 +493,14 @@ def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str
         return star_lines(comparison.channels[other], max_lines, rest)
     stars = comparison.differing
     lines = [star.line() for star in stars[:max_lines]]
-    return [*lines, f"and {len(stars) - max_lines} more{rest}"] if len(stars) > max_lines else lines
+    if len(stars) > max_lines:
+        return [*lines, f"and {len(stars) - max_lines} more{rest}"]
+    return lines
 
 
 def _other_channel(comparison: SkyComparison) -> str | None:
     """The first channel that is not the same; None where all are."""
-    return next((name for name, one in comparison.channels.items() if not one.same), None)
+    return next((name for name, channel in comparison.channels.items() if not channel.same), None)
 
 
 def finding(comparison: SkyComparison) -> str:

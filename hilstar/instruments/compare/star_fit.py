@@ -81,7 +81,8 @@ class StarTemplates:
         """The columns' products with one another (3 n, 3 n): along x times along y, for the
         stars that overlap.
         """
-        size, width = len(self.places_px), self._x.share.shape[1]
+        size = len(self.places_px)
+        width = self._x.share.shape[1]
         middles = np.column_stack([self._x.middle, self._y.middle])
         near = (
             cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
@@ -95,7 +96,8 @@ class StarTemplates:
             [along_y[:, ya, yb] * along_x[:, xa, xb] for ya, xa in entry for yb, xb in entry],
             axis=1,
         )
-        row, col = (3 * star[:, None] + np.arange(9) // 3, 3 * other[:, None] + np.arange(9) % 3)
+        row = 3 * star[:, None] + np.arange(9) // 3
+        col = 3 * other[:, None] + np.arange(9) % 3
         return csc_array((blocks.ravel(), (row.ravel(), col.ravel())), shape=(3 * size, 3 * size))
 
     @cached_property
@@ -128,9 +130,10 @@ class StarTemplates:
         size = len(flux)
         blocks = np.zeros((size, 3, 3))
         entries = self.normal.tocoo()
-        own = entries.row // 3 == entries.col // 3
-        row, col = entries.row[own], entries.col[own]
-        blocks[row // 3, row % 3, col % 3] = entries.data[own]
+        is_own = entries.row // 3 == entries.col // 3
+        row = entries.row[is_own]
+        col = entries.col[is_own]
+        blocks[row // 3, row % 3, col % 3] = entries.data[is_own]
         variance = np.diagonal(np.linalg.pinv(blocks, hermitian=True), axis1=1, axis2=2)
         fluxes = entries.row % 3 + entries.col % 3 == 0
         near = np.bincount(
@@ -205,8 +208,8 @@ def star_psf(image: FloatArray) -> GaussianPsf:
         for part in correlations
     )
     first = GaussianPsf((x, y))
-    found = bright_pixels(image, RIPPLE_SHARE * around(image, first))
-    places = _apart(found, first.footprint_px, (image.shape[1], image.shape[0]))
+    bright = bright_pixels(image, RIPPLE_SHARE * around(image, first))
+    places = _apart(bright, first.footprint_px, (image.shape[1], image.shape[0]))
     points = star_points(image, places, first.footprint_px // 2 + 1)
     covariance = np.tile([x * x, y * y, 0.0], (len(places), 1))
     start = PointGaussians(places[:, 0], places[:, 1], covariance)
@@ -220,7 +223,8 @@ def star_points(image: FloatArray, places_px: FloatArray, reach_px: int) -> Poin
     middle = np.rint(places_px).astype(np.intp)
     steps = np.arange(2 * reach_px + 1)
     padded = np.pad(image, reach_px)
-    rows, columns = middle[:, 1, None] + steps, middle[:, 0, None] + steps
+    rows = middle[:, 1, None] + steps
+    columns = middle[:, 0, None] + steps
     images = padded[rows[:, :, None], columns[:, None, :]]
     none_px = np.zeros(len(middle))
     return PointImages(
@@ -243,7 +247,8 @@ def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
     """Places (n, 2) of stars, px, refined from their brightest pixels, or from places known
     well: all stars at once.
     """
-    start, shape = places_px, (image.shape[0], image.shape[1])
+    start = places_px
+    shape = (image.shape[0], image.shape[1])
     last = np.array([shape[1] - 1, shape[0] - 1])
     outwards = BEYOND_SIGMAS * np.array(psf.width_px)
     low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
@@ -252,7 +257,8 @@ def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
         step = np.clip(
             shifts_px(StarTemplates(places_px, psf, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX
         )
-        before, places_px = places_px, np.clip(places_px + step, low, high)
+        before = places_px
+        places_px = np.clip(places_px + step, low, high)
         if np.abs(places_px - before).max(initial=0.0) < MIN_STEP_PX:
             break
     return places_px
@@ -289,11 +295,11 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
     """The table's stars, and the image's where the table has none. Raises InputError for a table
     of another sky.
     """
-    found = bright_pixels(golden, RIPPLE_SHARE * around(golden, psf))
+    bright = bright_pixels(golden, RIPPLE_SHARE * around(golden, psf))
     if truth is None:
-        return nameless_seeds(found, psf)
+        return nameless_seeds(bright, psf)
     blend_px = blend_distance_px(psf)
-    if not _has(truth, found, blend_px):
+    if not _has(truth, bright, blend_px):
         raise InputError(
             "compare: the truth table's stars are not where the golden image has them; give the"
             " table of that frame"
@@ -303,8 +309,8 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
     listed = _blended(Seeds(places, [_name_of(row) for row in table]), blend_px)
     # The light of a star off the image is brightest at the image's edge.
     shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
-    away = _nearest(shown, found)[0] > blend_px
-    unlisted = nameless_seeds(found[away], psf)
+    away = _nearest(shown, bright)[0] > blend_px
+    unlisted = nameless_seeds(bright[away], psf)
     return Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
 
 
@@ -364,11 +370,10 @@ def _blended(seeds: Seeds, blend_px: float) -> Seeds:
     size = len(seeds.places_px)
     pairs = cKDTree(seeds.places_px).query_pairs(blend_px, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
-    group = (
-        np.asarray(connected_components(links, directed=False)[1], dtype=np.intp)
-        if size
-        else np.zeros(0, dtype=np.intp)
-    )
+    if size:
+        group = np.asarray(connected_components(links, directed=False)[1], dtype=np.intp)
+    else:
+        group = np.zeros(0, dtype=np.intp)
     _, first = np.unique(group, return_index=True)
     hips: dict[int, tuple[int | str, ...]] = {}
     for label, hip in zip(group.tolist(), seeds.hip, strict=True):

@@ -59,23 +59,26 @@ class FixedPattern:
     def variance_dn2(self, light_dn: FloatArray) -> FloatArray:
         """Variance of a pixel about its neighbours at a level of light."""
         response, *offsets = self.rms
-        return np.asarray((response * light_dn) ** 2 + math.fsum(one**2 for one in offsets))
+        return np.asarray((response * light_dn) ** 2 + math.fsum(offset**2 for offset in offsets))
 
     def words(self) -> str:
         """What was found, or under what it is (two sigmas)."""
-        said = []
+        parts = []
         for name, square, error, rms in zip(
             NAMES, self.squares, self.errors, self.rms, strict=True
         ):
             if not math.isfinite(error):
                 continue
             times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
-            found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}" if rms else ""
-            said.append(
+            if rms:
+                found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}"
+            else:
+                found = ""
+            parts.append(
                 f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'}"
                 f" {unit}"
             )
-        return ", ".join(said)
+        return ", ".join(parts)
 
 
 NO_PATTERN = FixedPattern()
@@ -98,12 +101,14 @@ def fixed_pattern(
             & (np.abs(off) < PATTERN_CLIP * math.sqrt(float((off[use] ** 2).mean())))
             & (level > 0)
         )
-        off, level = np.where(use, off - off[use].mean(), 0.0), np.where(use, level, 1.0)
+        off = np.where(use, off - off[use].mean(), 0.0)
+        level = np.where(use, level, 1.0)
         for axis, sums in ((0, columns), (1, rows)):
             count = use.sum(axis=axis)
             sums.add(off.sum(axis=axis) / np.maximum(count, 1), count > use.shape[axis] / 4)
         # neighbours' differences: what is smooth is the sky's or the lens's
-        off, use = (off[:, 1:] - off[:, :-1]) / math.sqrt(2), use[:, 1:] & use[:, :-1]
+        off = (off[:, 1:] - off[:, :-1]) / math.sqrt(2)
+        use = use[:, 1:] & use[:, :-1]
         level = (level[:, 1:] + level[:, :-1]) / 2
         for sums, values in (
             (pixels, off),
@@ -115,23 +120,26 @@ def fixed_pattern(
     if pixels.photographs < 2 or not pixels.pairs:
         return None
     (column, column_error), (row, row_error), (both, both_error), (share, share_error) = (
-        one.mean() for one in (columns, rows, pixels, shares)
+        component.mean() for component in (columns, rows, pixels, shares)
     )
-    height, width = use.shape[0], use.shape[1] + 1
+    height = use.shape[0]
+    width = use.shape[1] + 1
     (column, column_error), (row, row_error) = _lines_alone(
         (column, column_error), (row, row_error), both, (height, width)
     )
-    lit, dim = light.mean()[0], inverse.mean()[0]
-    both, share = both - max(column, 0.0), share - max(column, 0.0) * dim
+    lit = light.mean()[0]
+    dim = inverse.mean()[0]
+    both = both - max(column, 0.0)
+    share = share - max(column, 0.0) * dim
     # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim
     apart = lit * dim - 1
-    response, offset = (both * dim - share) / apart, (share * lit - both) / apart
-    response_error, offset_error = (
-        math.hypot(both_error * dim, share_error) / apart,
-        math.hypot(share_error * lit, both_error) / apart,
-    )
+    response = (both * dim - share) / apart
+    offset = (share * lit - both) / apart
+    response_error = math.hypot(both_error * dim, share_error) / apart
+    offset_error = math.hypot(share_error * lit, both_error) / apart
     if offset < FOUND_SIGMAS * offset_error:
-        response, response_error = both / lit, both_error / lit
+        response = both / lit
+        response_error = both_error / lit
     return FixedPattern(
         (response, offset, column, row), (response_error, offset_error, column_error, row_error)
     )
@@ -201,8 +209,10 @@ def sky_level(dn: FloatArray, step: float) -> SkyLevel:
     """
     height, width = dn.shape
     side = int(np.clip(min(height, width) // MIN_BLOCKS, MIN_BLOCK_PX, BLOCK_PX))
-    rows, columns = max(height // side, 1), max(width // side, 1)
-    high, wide = height // rows, width // columns
+    rows = max(height // side, 1)
+    columns = max(width // side, 1)
+    high = height // rows
+    wide = width // columns
     blocks = (
         dn[: rows * high, : columns * wide]
         .reshape(rows, high, columns, wide)
@@ -212,21 +222,23 @@ def sky_level(dn: FloatArray, step: float) -> SkyLevel:
     middle = np.median(blocks, axis=2, keepdims=True)
     sigma = MAD_TO_SIGMA * np.median(np.abs(blocks - middle), axis=2, keepdims=True) + step / 2
     for _ in range(ROUNDS):
-        kept = np.abs(blocks - middle) <= CLIP * sigma
-        count = np.maximum(kept.sum(axis=2, keepdims=True), 1)
-        middle = (blocks * kept).sum(axis=2, keepdims=True) / count
+        is_sky = np.abs(blocks - middle) <= CLIP * sigma
+        count = np.maximum(is_sky.sum(axis=2, keepdims=True), 1)
+        middle = (blocks * is_sky).sum(axis=2, keepdims=True) / count
         sigma = (
-            np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
+            np.sqrt(((blocks - middle) ** 2 * is_sky).sum(axis=2, keepdims=True) / count) / CLIPPED
         )
         sigma = np.maximum(sigma, step / 12**0.5)
-    level, noise = middle[..., 0], sigma[..., 0]
+    level = middle[..., 0]
+    noise = sigma[..., 0]
     if min(level.shape) > 2:  # a block full of a bright star's light is as its neighbours
         others, quiet = (ndimage.median_filter(part, 3, mode="nearest") for part in (level, noise))
         bright = level > others + BRIGHT_BLOCK * quiet
-        level, noise = np.where(bright, others, level), np.minimum(noise, NOISY_BLOCK * quiet)
-    places = [
-        (np.arange(size) - (one - 1) / 2) / one for size, one in ((height, high), (width, wide))
-    ]
+        level = np.where(bright, others, level)
+        noise = np.minimum(noise, NOISY_BLOCK * quiet)
+    places = []
+    for size, size_px in ((height, high), (width, wide)):
+        places.append((np.arange(size) - (size_px - 1) / 2) / size_px)
     return SkyLevel(
         _between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side
     )
@@ -244,7 +256,8 @@ def is_round(dn: FloatArray) -> bool:
         return False
     *sky, near, far = map(np.median, rings)
     noise = MAD_TO_SIGMA * float(np.median(np.abs(rings[-1] - far)))
-    lit, unsure = min(sky[:2]) - far, 4 * noise / len(rings[-1]) ** 0.5
+    lit = min(sky[:2]) - far
+    unsure = 4 * noise / len(rings[-1]) ** 0.5
     return bool(lit > max(0.3 * noise, 10 * unsure) and abs(near - far) < 0.05 * lit + unsure)
 
 
@@ -299,20 +312,21 @@ def find_sources(sigmas: FloatArray) -> FoundSources:
     above = smooth > THRESHOLD
     labels, count = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
     y, x = np.nonzero(above)
-    blob, value = labels[y, x] - 1, smooth[y, x]
+    blob = labels[y, x] - 1
+    value = smooth[y, x]
     total = np.maximum(np.bincount(blob, value, minlength=count), 1e-9)
     mx, my = (np.bincount(blob, value * part, minlength=count) / total for part in (x, y))
     area = np.maximum(np.bincount(blob, minlength=count), 1)
-    dx, dy = x - mx[blob], y - my[blob]
+    dx = x - mx[blob]
+    dy = y - my[blob]
     xx, yy, xy = (
         np.bincount(blob, part, minlength=count) / area + 1 / 12 * same
         for part, same in ((dx * dx, 1), (dy * dy, 1), (dx * dy, 0))
     )
-    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    length, width = (
-        np.sqrt(12 * (middle + spread)),
-        np.sqrt(12 * np.maximum(middle - spread, 1 / 12)),
-    )
+    middle = (xx + yy) / 2
+    spread = np.hypot((xx - yy) / 2, xy)
+    length = np.sqrt(12 * (middle + spread))
+    width = np.sqrt(12 * np.maximum(middle - spread, 1 / 12))
     peak = np.zeros(count)
     np.maximum.at(peak, blob, value)
     fwhm = 2 * np.sqrt(np.bincount(blob, value > peak[blob] / 2, minlength=count) / np.pi)
@@ -357,9 +371,7 @@ def _single(sigmas: FloatArray, x_px: FloatArray, y_px: FloatArray) -> BoolArray
     rows, columns = (np.rint(place).astype(np.intp)[:, None] + reach + 3 for place in (y_px, x_px))
     patch = padded[rows[:, :, None], columns[:, None, :]].reshape(len(x_px), 9)
     best = patch.argmax(axis=1)
-    row, column = (
-        np.rint(y_px).astype(np.intp) + best // 3 + 2,
-        np.rint(x_px).astype(np.intp) + best % 3 + 2,
-    )
+    row = np.rint(y_px).astype(np.intp) + best // 3 + 2
+    column = np.rint(x_px).astype(np.intp) + best % 3 + 2
     around = [padded[row + dy, column + dx] for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
     return np.asarray(np.mean(around, axis=0) + 0.75 < 0.04 * padded[row, column])

@@ -104,9 +104,9 @@ class Pointing:
         """Height of the boresight over the horizon, where the air or refraction told it."""
         if self.air is not None:
             return math.degrees(math.asin(float(np.clip(self.boresight @ self.air.up, -1, 1))))
-        return (
-            None if self.zenith is None else 90 - math.degrees(math.atan(math.hypot(*self.zenith)))
-        )
+        if self.zenith is None:
+            return None
+        return 90 - math.degrees(math.atan(math.hypot(*self.zenith)))
 
     def seen(self, vectors: FloatArray) -> FloatArray:
         """Directions (n, 3), ICRS, as the air bends them."""
@@ -150,11 +150,13 @@ class CameraFit:
 
     def residuals_px(self, photographs: Sequence[Places]) -> list[FloatArray]:
         """Seen minus predicted (n, 2) of each photograph, px."""
-        found = []
-        for one, pointing in zip(photographs, self.pointings, strict=True):
-            x, y = pointing.places_px(self.camera, one.vectors)
-            found.append(np.nan_to_num(np.column_stack([one.x_px - x, one.y_px - y]), nan=1e3))
-        return found
+        residuals = []
+        for photograph, pointing in zip(photographs, self.pointings, strict=True):
+            x, y = pointing.places_px(self.camera, photograph.vectors)
+            residuals.append(
+                np.nan_to_num(np.column_stack([photograph.x_px - x, photograph.y_px - y]), nan=1e3)
+            )
+        return residuals
 
 
 def with_values(camera: Camera, values: dict[str, float]) -> Camera:
@@ -192,41 +194,50 @@ class _CameraLoss:
         names: tuple[str, ...],
         floor_px: float,
     ) -> None:
-        self.base, self.pointings, self.names = base, pointings, names
-        self.owner = np.repeat(np.arange(len(photographs)), [len(one.x_px) for one in photographs])
+        self.base = base
+        self.pointings = pointings
+        self.names = names
+        self.owner = np.repeat(
+            np.arange(len(photographs)), [len(photograph.x_px) for photograph in photographs]
+        )
         self.x_px, self.y_px, sigma_px = (
-            np.concatenate([getattr(one, name) for one in photographs])
+            np.concatenate([getattr(photograph, name) for photograph in photographs])
             for name in ("x_px", "y_px", "sigma_px")
         )
         self.sigma_px = np.hypot(sigma_px, floor_px)
-        seen = [  # in cam as it is, behind an air that is known
-            (one.air.bent(places.vectors) if one.air is not None else places.vectors)
-            @ to_matrix(one.q_icrs_to_cam).T
-            for one, places in zip(pointings, photographs, strict=True)
+        star_vectors = [  # in cam as it is, behind an air that is known
+            (photograph.air.bent(places.vectors) if photograph.air is not None else places.vectors)
+            @ to_matrix(photograph.q_icrs_to_cam).T
+            for photograph, places in zip(pointings, photographs, strict=True)
         ]
-        self.cam = np.concatenate(seen)
+        self.cam = np.concatenate(star_vectors)
         self.bent = np.array(
-            [one.zenith is not None and one.air is None for one in pointings], dtype=bool
+            [photograph.zenith is not None and photograph.air is None for photograph in pointings],
+            dtype=bool,
         )
         self.zenith_of = np.cumsum(self.bent) - 1  # the row of a photograph's zenith
 
     def start(self) -> FloatArray:
         """The numbers of the base and the pointings as they are."""
         lens = self.base.lens or Lens()
-        own = dict(zip(LENS_NAMES, (*lens.radial[:2], *lens.tangential), strict=True))
-        zeniths = [
-            one.zenith
-            for one, bent in zip(self.pointings, self.bent, strict=True)
-            if bent and one.zenith
-        ]
+        lens_values = dict(zip(LENS_NAMES, (*lens.radial[:2], *lens.tangential), strict=True))
+        zeniths = []
+        for pointing, bent in zip(self.pointings, self.bent, strict=True):
+            if bent and pointing.zenith:
+                zeniths.append(pointing.zenith)
         turns = np.zeros(3 * len(self.pointings))
         return np.concatenate(
-            [[own.get(name, 0.0) / STEPS[name] for name in self.names], turns, np.ravel(zeniths)]
+            [
+                [lens_values.get(name, 0.0) / STEPS[name] for name in self.names],
+                turns,
+                np.ravel(zeniths),
+            ]
         )
 
     def parts(self, numbers: FloatArray) -> tuple[Camera, FloatArray, FloatArray]:
         """The camera, each photograph's turn (m, 4), and the fitted zeniths (z, 2) of numbers."""
-        own, last = len(self.names), len(self.names) + 3 * len(self.pointings)
+        camera_count = len(self.names)
+        last = len(self.names) + 3 * len(self.pointings)
         camera = with_values(
             self.base,
             {name: STEPS[name] * float(n) for name, n in zip(self.names, numbers, strict=False)},
@@ -238,18 +249,19 @@ class _CameraLoss:
             for a, b in zip(camera.principal_point_px, self.base.principal_point_px, strict=True)
         )
         follow = np.array([dy, -dx, 0.0]) / camera.focal_length_px
-        turns = from_rotation_vectors(ATTITUDE_STEP_RAD * numbers[own:last].reshape(-1, 3) + follow)
+        turns = from_rotation_vectors(
+            ATTITUDE_STEP_RAD * numbers[camera_count:last].reshape(-1, 3) + follow
+        )
         return camera, turns, numbers[last:].reshape(-1, 2)
 
     def unpacked(self, numbers: FloatArray) -> tuple[Camera, tuple[Pointing, ...]]:
         camera, turns, zeniths = self.parts(numbers)
-        found = [
-            replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam))
-            for p, q in zip(self.pointings, turns, strict=True)
-        ]
+        pointings = []
+        for p, q in zip(self.pointings, turns, strict=True):
+            pointings.append(replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam)))
         for i in np.flatnonzero(self.bent):
-            found[i] = replace(found[i], zenith=tuple(zeniths[self.zenith_of[i]].tolist()))
-        return camera, tuple(found)
+            pointings[i] = replace(pointings[i], zenith=tuple(zeniths[self.zenith_of[i]].tolist()))
+        return camera, tuple(pointings)
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
         """Those of all places, x and then y, then the priors."""
@@ -270,7 +282,9 @@ class _CameraLoss:
         """Derivatives by differences: a photograph's own numbers move its own places alone, all
         photographs' at once.
         """
-        own, stars, photographs = len(self.names), len(self.owner), len(self.pointings)
+        camera_count = len(self.names)
+        stars = len(self.owner)
+        photographs = len(self.pointings)
         found = np.zeros((len(off), len(numbers)))
 
         def changed(columns: IntArray) -> FloatArray:
@@ -278,25 +292,29 @@ class _CameraLoss:
             moved[columns] += DIFFERENCE
             return (self.residuals(moved) - off) / DIFFERENCE
 
-        for k in range(own):
+        for k in range(camera_count):
             found[:, k] = changed(np.array([k]))
-        each = [
-            (np.arange(own + k, own + 3 * photographs, 3), self.owner, np.arange(stars))
+        axis_places = [
+            (
+                np.arange(camera_count + k, camera_count + 3 * photographs, 3),
+                self.owner,
+                np.arange(stars),
+            )
             for k in range(3)
         ]
         if self.bent.any():
             lit = np.flatnonzero(self.bent[self.owner])
             zenith = self.zenith_of[self.owner[lit]]
-            each += [
-                (np.arange(own + 3 * photographs + k, len(numbers), 2), zenith, lit)
+            axis_places += [
+                (np.arange(camera_count + 3 * photographs + k, len(numbers), 2), zenith, lit)
                 for k in range(2)
             ]
-        for columns, which, rows in each:
+        for columns, which, rows in axis_places:
             change = changed(columns)
             for first in (0, stars):
                 found[first + rows, columns[which]] = change[first + rows]
-        priors = np.arange(own + 3 * photographs, len(numbers))
-        found[2 * stars + own + np.arange(len(priors)), priors] = 1 / ZENITH_PRIOR
+        priors = np.arange(camera_count + 3 * photographs, len(numbers))
+        found[2 * stars + camera_count + np.arange(len(priors)), priors] = 1 / ZENITH_PRIOR
         return found
 
 
@@ -334,12 +352,15 @@ def minimised(
         size = np.abs(off)
         return float(np.where(size <= HUBER, size**2 / 2, HUBER * (size - HUBER / 2)).sum())
 
-    off, damping = residuals(numbers), FIRST_DAMPING
-    best, normal = value(off), np.eye(len(numbers))
+    off = residuals(numbers)
+    damping = FIRST_DAMPING
+    best = value(off)
+    normal = np.eye(len(numbers))
     for _ in range(MAX_STEPS):
         design = slopes(numbers, off)
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), HUBER))
-        normal, downhill = design.T @ (weight[:, None] * design), design.T @ (weight * off)
+        normal = design.T @ (weight[:, None] * design)
+        downhill = design.T @ (weight * off)
         for _ in range(MAX_DAMPINGS):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -downhill)
             trial = residuals(numbers + step)
@@ -349,7 +370,11 @@ def minimised(
             damping *= 10
         else:
             break
-        gain, numbers, off, best, damping = best - new, numbers + step, trial, new, damping / 10
+        gain = best - new
+        numbers = numbers + step
+        off = trial
+        best = new
+        damping = damping / 10
         if gain < least_gain:
             break
     return numbers, normal
@@ -362,16 +387,16 @@ def own_floor_px(
     without their tails.
     """
     off = np.concatenate(residuals).ravel()
-    sigma = np.repeat(np.concatenate([one.sigma_px for one in photographs]), 2)
+    sigma = np.repeat(np.concatenate([photograph.sigma_px for photograph in photographs]), 2)
     scale = math.sqrt(len(off) / max(len(off) - numbers, 1))
-    low, high = 0.0, 10.0
+    low = 0.0
+    high = 10.0
     for _ in range(40):
         middle = (low + high) / 2
-        spread = (
-            scale * MAD_TO_SIGMA * float(np.median(np.abs(off / np.hypot(sigma, middle))))
-            if len(off)
-            else 0.0
-        )
+        if len(off):
+            spread = scale * MAD_TO_SIGMA * float(np.median(np.abs(off / np.hypot(sigma, middle))))
+        else:
+            spread = 0.0
         low, high = (middle, high) if spread > 1 else (low, middle)
     return high
 
@@ -391,7 +416,7 @@ def fit_camera(
     model serves without it.
     """
     bare = tuple(pointings)
-    count = sum(len(one.x_px) for one in photographs)
+    count = sum(len(photograph.x_px) for photograph in photographs)
     numbers = 3 * len(bare)
     enough = {
         name: names
@@ -405,20 +430,26 @@ def fit_camera(
     if not last:
         return CameraFit(_bounded(camera) or camera, bare, largest, floor_px=floor)
     models = {name: models[name] for name in [*models][: [*models].index(largest) + 1]}
-    chosen, best, held = largest, math.inf, {}
+    chosen = largest
+    best = math.inf
+    held = {}
     for name, names in models.items():
         held[name] = _held_out(base, bare, photographs, names, floor)
         if held[name] < GAIN * best:
-            best, chosen = held[name], name
+            best = held[name]
+            chosen = name
     names = models[chosen]
     if chosen != largest:
         camera, bare, floor = _settled(base, bare, photographs, names)
-    if any(one.air is None for one in bare):
+    if any(photograph.air is None for photograph in bare):
         bent = tuple(
-            one if one.air else _with_zenith(camera, one, places, floor)
-            for one, places in zip(bare, photographs, strict=True)
+            photograph if photograph.air else _with_zenith(camera, photograph, places, floor)
+            for photograph, places in zip(bare, photographs, strict=True)
         )
-        plain_px = best if chosen == largest else _held_out(camera, bare, photographs, names, floor)
+        if chosen == largest:
+            plain_px = best
+        else:
+            plain_px = _held_out(camera, bare, photographs, names, floor)
         bent_px = _held_out(camera, bent, photographs, names, floor)
         held[f"{chosen}, refraction"] = bent_px
         if bent_px < GAIN * plain_px:
@@ -460,8 +491,8 @@ def k1_camera(
     base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places]
 ) -> tuple[Camera, list[Pointing]]:
     """The camera of least terms that has a distortion, and the pointings."""
-    camera, found, _ = _settled(base, tuple(pointings), photographs, MODELS["k1"])
-    return _bounded(camera) or camera, list(found)
+    camera, fitted_pointings, _ = _settled(base, tuple(pointings), photographs, MODELS["k1"])
+    return _bounded(camera) or camera, list(fitted_pointings)
 
 
 def _bounded(camera: Camera) -> Camera | None:
@@ -507,12 +538,16 @@ def _held_out(
     # from which folds are near
     camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor_px)
     for fold in range(FOLDS):
-        out = [np.arange(len(one.x_px)) % FOLDS == fold for one in photographs]
-        kept = [one.at(~mask) for one, mask in zip(photographs, out, strict=True)]
-        found, turned, _ = fit_model(camera, pointings, kept, names, floor_px)
-        tested = [one.at(mask) for one, mask in zip(photographs, out, strict=True)]
-        for one, off in zip(tested, CameraFit(found, turned, "").residuals_px(tested), strict=True):
-            sigma = np.hypot(one.sigma_px, floor_px)[:, None]
+        out = [np.arange(len(photograph.x_px)) % FOLDS == fold for photograph in photographs]
+        fitted_stars = [
+            photograph.at(~mask) for photograph, mask in zip(photographs, out, strict=True)
+        ]
+        held_camera, turned, _ = fit_model(camera, pointings, fitted_stars, names, floor_px)
+        tested = [photograph.at(mask) for photograph, mask in zip(photographs, out, strict=True)]
+        for photograph, off in zip(
+            tested, CameraFit(held_camera, turned, "").residuals_px(tested), strict=True
+        ):
+            sigma = np.hypot(photograph.sigma_px, floor_px)[:, None]
             squares += float((np.clip(off / sigma, -HUBER - 1, HUBER + 1) ** 2).sum())
             weights += 2 * float((1 / sigma**2).sum())
     return math.sqrt(squares / max(weights, 1e-12))
@@ -528,17 +563,21 @@ def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: f
     # a zenith (a, b) squeezes a field by 1 + a^2 along x, 1 + b^2 along y and a b across both: it
     # is known but for its sign
     (cx, cy), zero = camera.principal_point_px, np.zeros(len(places.x_px))
-    u, v, one = places.x_px - cx, places.y_px - cy, zero + 1
-    columns = [(one, zero), (zero, one), (v, -u), (u, v), (u, -v), (v, u)]
+    u = places.x_px - cx
+    v = places.y_px - cy
+    ones = zero + 1
+    columns = [(ones, zero), (zero, ones), (v, -u), (u, v), (u, -v), (v, u)]
     weight = 1 / np.hypot(places.sigma_px, floor_px)
     design = np.stack([np.concatenate([x * weight, y * weight]) for x, y in columns], axis=1)
     plain = np.clip(off(replace(pointing, zenith=None)).T.ravel(), -5, 5)
     *_, p, q = np.linalg.lstsq(design, plain, rcond=None)[0].tolist()
-    tangent, angle = math.sqrt(2 * math.hypot(p, q) / REFRACTION_RAD), math.atan2(-q, -p) / 2
+    tangent = math.sqrt(2 * math.hypot(p, q) / REFRACTION_RAD)
+    angle = math.atan2(-q, -p) / 2
     tangent = min(max(tangent, 0.3), 3.0)
-    starts = [
-        replace(pointing, zenith=(s * tangent * math.cos(angle), s * tangent * math.sin(angle)))
-        for s in (1, -1)
-    ]
+    starts = []
+    for s in (1, -1):
+        starts.append(
+            replace(pointing, zenith=(s * tangent * math.cos(angle), s * tangent * math.sin(angle)))
+        )
     fits = [fit_model(camera, [start], [places], (), floor_px)[1][0] for start in starts]
     return min(fits, key=lambda trial: float(np.minimum(off(trial) ** 2, 9).sum()))

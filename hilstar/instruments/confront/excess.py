@@ -112,7 +112,10 @@ def _light(
     noise = np.array([MAG * row.sigma_dn / row.dn for row in rows])
     sigma_v = np.array([v.shot.sky.within(np.array([row.star]))[0][0] for v, row in every])
     known = np.array(["variable" in row.flags or "double" in row.flags for row in rows])
-    steady = _ms(off_mag[~known]) if (~known).sum() >= MIN_STARS else _ms(off_mag)
+    if (~known).sum() >= MIN_STARS:
+        steady = _ms(off_mag[~known])
+    else:
+        steady = _ms(off_mag)
     parts = [
         Part(
             "photon and background noise",
@@ -197,8 +200,8 @@ def _scintillation(
     Young's law.
     """
     star = np.unique([row.star for _, row in every], return_inverse=True)[1]
-    seen = np.bincount(star)[star]
-    twice = seen > 1
+    sightings = np.bincount(star)[star]
+    twice = sightings > 1
     free = int(twice.sum()) - len(np.unique(star[twice]))
     if free >= MIN_STARS:
         mean = np.bincount(star, off_mag) / np.bincount(star)
@@ -208,7 +211,7 @@ def _scintillation(
         how = f"what changes between photographs of a star beyond noise, by {free} stars seen again"
         return Part("scintillation", math.sqrt(max(changed, 0.0)), how)
     tracker = session.file.config.tracker
-    masses = [one for one in session.light.masses if one is not None]
+    masses = [air_mass for air_mass in session.light.masses if air_mass is not None]
     if not masses or tracker.exposure_s <= 0:
         return Part(
             LAW,
@@ -216,7 +219,8 @@ def _scintillation(
             "not known: no star is in two photographs, and no air mass, as refraction was not"
             " fitted",
         )
-    mass, site = float(np.mean(masses)), session.file.config.site
+    mass = float(np.mean(masses))
+    site = session.file.config.site
     height_m = 0.0 if site is None else site.height_m
     sigma = float(young(tracker.aperture_mm, np.array([mass]), height_m, tracker.exposure_s)[0])
     how = (
@@ -231,8 +235,8 @@ def _scintillation(
 
 
 def _rest(whole: float, parts: Sequence[Part]) -> Part:
-    measured = [one for one in parts if math.isfinite(one.rms) and one.name != LAW]
-    rest = whole - math.fsum(one.rms**2 for one in measured)
+    measured = [part for part in parts if math.isfinite(part.rms) and part.name != LAW]
+    rest = whole - math.fsum(part.rms**2 for part in measured)
     return Part("unexplained", math.sqrt(max(rest, 0.0)), "what is left of the squares")
 
 

@@ -76,7 +76,8 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     """Write the camera of a session as a bench file and the files it names. Raises InputError
     where they cannot be written.
     """
-    camera, pixels = session.camera.camera, session.pixels
+    camera = session.camera.camera
+    pixels = session.pixels
     tracker = session.file.config.tracker
     lens = camera.lens or Lens()
     sigma = session.camera.sigma
@@ -174,7 +175,8 @@ def _dated_sky(session: Session, given: dict[str, Any]) -> dict[str, Any]:
     given_utc = sky.pop("epoch_utc", None)
     for key in ("epoch_jyear", "observer_velocity_km_s"):
         sky.pop(key, None)
-    first_ns, dated = session.shots[0].photo.t_ns, session.shots[0].sky
+    first_ns = session.shots[0].photo.t_ns
+    dated = session.shots[0].sky
     bodies = bool(sky.get("bodies"))
     if first_ns is not None and (session.air is not None or bodies):
         sky["epoch_utc"] = f"{np.datetime64(first_ns, 'ns').astype('datetime64[ms]')}Z"
@@ -192,7 +194,8 @@ def _detector(session: Session, given: dict[str, Any]) -> dict[str, Any]:
     """The keys of [tracker.detector]; a gain that neither photographs nor the `given` keys tell
     is none of them.
     """
-    pixels, full_dn = session.pixels, session.shots[0].photo.full_dn
+    pixels = session.pixels
+    full_dn = session.shots[0].photo.full_dn
     gain = pixels.gain_e_per_dn
     full_e = (full_dn - pixels.pedestal_dn) * gain
     # a file's levels may be steps of several DN, whose rounding is noise to a detector of steps of
@@ -217,15 +220,15 @@ def _detector(session: Session, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    absolute: dict[str, Any] = {}
     for key, value in tables.items():
         if isinstance(value, dict):
-            found[key] = _absolute(value, folder)
+            absolute[key] = _absolute(value, folder)
         elif key in PATH_KEYS and isinstance(value, str) and (folder / value).is_file():
-            found[key] = str((folder / value).resolve())
+            absolute[key] = str((folder / value).resolve())
         else:
-            found[key] = value
-    return found
+            absolute[key] = value
+    return absolute
 
 
 def _toml(table: dict[str, Any], name: str = "") -> Iterable[str]:
@@ -269,7 +272,8 @@ def _write_efficiency(path: Path, session: Session) -> tuple[float, float]:
 
 
 def _write_psf(path: Path, session: Session) -> None:
-    psf, light = session.psf, session.light
+    psf = session.psf
+    light = session.light
     width, height = psf.size_px
     across, down = (np.linspace(0, size - 1, GRID) for size in (width, height))
     places = np.array([(x, y) for x in across for y in down])
@@ -329,16 +333,19 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
         return StarPsf(np.array([[x * x], [y * y], [0.0]]), 0.0, 0.0, 2.0, size), (0.0, 0.0)
     glass = glass_in(tracker, file.folder)
     if glass is None:
-        one = read_psf(file.folder / tracker.optics.psf)
+        stated_psf = read_psf(file.folder / tracker.optics.psf)
         return _fitted(
-            np.asarray(one.samples)[None], one.per_px, np.array([[size[0] / 2, size[1] / 2]]), size
+            np.asarray(stated_psf.samples)[None],
+            stated_psf.per_px,
+            np.array([[size[0] / 2, size[1] / 2]]),
+            size,
         ), (0.0, 0.0)
-    own = "".join(
+    model_text = "".join(
         str(line).removeprefix(MODEL) for line in glass.history if str(line).startswith(MODEL)
     )
-    if own:
+    if model_text:
         try:
-            numbers = msgspec.json.decode(own)
+            numbers = msgspec.json.decode(model_text)
             wing_share, wing_sigma = numbers["wing"]
             a, b = numbers["vignetting"]
             return StarPsf(
@@ -368,10 +375,10 @@ def _fitted(
     stamps = np.zeros((len(images), STAMP_PX, STAMP_PX))
     middle = images.shape[-1] // 2
     offsets = np.rint((np.arange(images.shape[-1]) - middle) / per_px).astype(np.intp)
-    kept = np.abs(offsets) <= HALF
-    at = offsets[kept] + HALF
+    is_near = np.abs(offsets) <= HALF
+    at = offsets[is_near] + HALF
     for stamp, image in zip(stamps, images, strict=True):
-        np.add.at(stamp, (at[:, None], at[None, :]), image[np.ix_(kept, kept)])
+        np.add.at(stamp, (at[:, None], at[None, :]), image[np.ix_(is_near, is_near)])
     columns, rows = np.rint(places_px).T
     level = Stamps(
         1e6 * stamps, np.full_like(stamps, 1.0), columns, rows, np.full(len(stamps), 0.65)

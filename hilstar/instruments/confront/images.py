@@ -52,7 +52,9 @@ class Photograph:
     @property
     def name(self) -> str:
         """The file's name, and the plane."""
-        return f"{self.path.name}[{self.plane}]" if self.plane else self.path.name
+        if self.plane:
+            return f"{self.path.name}[{self.plane}]"
+        return self.path.name
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -91,12 +93,16 @@ def read_photographs(
             f" = [{size[0]}, {size[1]}]"
         )
     step, full = _levels(path, dn)
-    t_ns, notes = at_ns if at_ns is not None else facts.t_ns, facts.notes
+    t_ns = at_ns if at_ns is not None else facts.t_ns
+    notes = facts.notes
     if t_ns is None and (named := NAMED_TIME.search(path.name)):
         t_ns = utc_ns(f"{named[1]}T{named[2]}:{named[3]}:{named[4]}")
-        notes = (*notes, "its time is read from its name, as UTC") if t_ns is not None else notes
-    found = Photograph(path, dn, step, full, t_ns, facts.exposure_s, "", notes)
-    return list(_planes(found, facts.bayer)) if facts.bayer else [found]
+        if t_ns is not None:
+            notes = (*notes, "its time is read from its name, as UTC")
+    photograph = Photograph(path, dn, step, full, t_ns, facts.exposure_s, "", notes)
+    if facts.bayer:
+        return list(_planes(photograph, facts.bayer))
+    return [photograph]
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +219,10 @@ def _picture(
                     f"{path}: holds colours of a palette or of print ({picture.mode}); {ADVICE}"
                 )
             begin_ns, exposure_s = _exif(picture.getexif())
-            t_ns = (
-                None if begin_ns is None else begin_ns + round((exposure_s or 0.0) / 2 * NS_PER_S)
-            )
+            if begin_ns is None:
+                t_ns = None
+            else:
+                t_ns = begin_ns + round((exposure_s or 0.0) / 2 * NS_PER_S)
             return np.asarray(picture), _Facts(t_ns, exposure_s, "", notes)
     except InputError:
         raise
@@ -231,11 +238,15 @@ def _picture(
 
 def _exif(exif: Any) -> tuple[int | None, float | None]:
     """UTC of the start, where EXIF has the offset from it, and the exposure."""
-    found = exif.get_ifd(EXIF_IFD) if exif else {}
-    exposure = found.get(EXIF_EXPOSURE)
-    date, offset = str(found.get(EXIF_DATE, "")), str(found.get(EXIF_OFFSET, ""))
+    exif_table = exif.get_ifd(EXIF_IFD) if exif else {}
+    exposure = exif_table.get(EXIF_EXPOSURE)
+    date = str(exif_table.get(EXIF_DATE, ""))
+    offset = str(exif_table.get(EXIF_OFFSET, ""))
     match = re.fullmatch(r"([+-])(\d\d):(\d\d)", offset)
-    begin_ns = utc_ns(date[:10].replace(":", "-") + "T" + date[11:19]) if match else None
+    if match:
+        begin_ns = utc_ns(date[:10].replace(":", "-") + "T" + date[11:19])
+    else:
+        begin_ns = None
     if begin_ns is not None and match is not None:
         ahead_s = (int(match[2]) * 60 + int(match[3])) * 60
         begin_ns -= (-1 if match[1] == "-" else 1) * ahead_s * NS_PER_S
@@ -244,9 +255,9 @@ def _exif(exif: Any) -> tuple[int | None, float | None]:
 
 def parse_utc(text: str) -> int:
     """The UTC of `--at`. Raises InputError."""
-    found = utc_ns(text)
-    if found is None:
+    t_ns = utc_ns(text)
+    if t_ns is None:
         raise InputError(
             f"--at {shortened(text)}: is no UTC; write one such as --at 2019-07-29T20:47:26"
         )
-    return found
+    return t_ns

@@ -89,17 +89,16 @@ class StarRow:
     @property
     def figures(self) -> tuple[float, ...]:
         """Those of a row of stars.csv, in its order."""
-        seen, predicted = (self.x_px, self.y_px), (self.x_predicted_px, self.y_predicted_px)
-        return *seen, *predicted, self.dn, self.dn_predicted, self.v_mag, self.b_v_mag
+        seen_px = (self.x_px, self.y_px)
+        predicted = (self.x_predicted_px, self.y_predicted_px)
+        return *seen_px, *predicted, self.dn, self.dn_predicted, self.v_mag, self.b_v_mag
 
     @property
     def off_mag(self) -> float:
         """Seen less predicted, mag."""
-        return (
-            -2.5 * math.log10(self.dn / self.dn_predicted)
-            if self.dn > 0 and self.dn_predicted > 0
-            else math.nan
-        )
+        if self.dn > 0 and self.dn_predicted > 0:
+            return -2.5 * math.log10(self.dn / self.dn_predicted)
+        return math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,12 +134,16 @@ class Verdict:
     @property
     def unexplained(self) -> list[SourceRow]:
         """Sources of LISTED_SNR and more that nothing explains."""
-        return [one for one in self.sources if not one.explained_by and one.snr >= LISTED_SNR]
+        return [
+            source
+            for source in self.sources
+            if not source.explained_by and source.snr >= LISTED_SNR
+        ]
 
     @property
     def missing(self) -> list[StarRow]:
         """Stars that should be there."""
-        return [one for one in self.stars if "missing" in one.flags]
+        return [star_row for star_row in self.stars if "missing" in star_row.flags]
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,9 +175,10 @@ class Judge:
         file = read_bench_file(tracker)
         config = file.config
         dated = session.shots[0].sky  # each photograph's air is put before its stars below
-        velocity = (
-            (0.0, 0.0, 0.0) if dated.velocity_km_s is None else tuple(dated.velocity_km_s.tolist())
-        )
+        if dated.velocity_km_s is None:
+            velocity = (0.0, 0.0, 0.0)
+        else:
+            velocity = tuple(dated.velocity_km_s.tolist())
         sky = msgspec.structs.replace(
             config.sky,
             faintest_v_mag=ALL_STARS_MAG,
@@ -215,7 +219,9 @@ class Judge:
             counts[0] += (off > HOT_SIGMAS) & alone
             counts[1] += off < -HOT_SIGMAS
         least = max(1, math.ceil(HOT_SHARE * len(session.shots)))
-        axes = np.array([to_matrix(one.q_icrs_to_cam)[2] for one in session.camera.pointings])
+        axes = np.array(
+            [to_matrix(pointing.q_icrs_to_cam)[2] for pointing in session.camera.pointings]
+        )
         moved_px = np.ptp(axes, axis=0).max() * session.camera.camera.focal_length_px
         # stars too may have one pixel, in each photograph: what no neighbour shares at all
         if moved_px < MOVED_PX:
@@ -224,8 +230,10 @@ class Judge:
 
     def of(self, number: int) -> Verdict:
         """The verdict on a photograph."""
-        session, shot = self.session, self.session.shots[number]
-        light_dn, level = self._light_dn(number), shot.level.level
+        session = self.session
+        shot = self.session.shots[number]
+        light_dn = self._light_dn(number)
+        level = shot.level.level
         variance = session.pixels.variance_dn2(level)
         noise = np.sqrt(variance + np.maximum(light_dn, 0) / session.pixels.gain_e_per_dn)
         residual = (shot.photo.dn - level - light_dn) / noise
@@ -272,14 +280,13 @@ class Judge:
         """The stars' light (height, width), DN, by `simulate`'s own code, behind the air of this
         photograph.
         """
-        session, stars, simulator, shot = (
-            self.session,
-            self._stars,
-            self._simulator,
-            self.session.shots[number],
-        )
+        session = self.session
+        stars = self._stars
+        simulator = self._simulator
+        shot = self.session.shots[number]
         pointing = session.camera.pointings[number]
-        air, rate = shot.sky.air, stars.electrons_per_s
+        air = shot.sky.air
+        rate = stars.electrons_per_s
         if air is not None and session.air is not None:
             rate = rate * session.air.shares(stars.row, air.altitude_rad(stars.vectors))[0]
         if session.light.colours.any() or shot.photo.plane:
@@ -297,7 +304,8 @@ class Judge:
         return np.asarray(exposure.mean_e / session.pixels.gain_e_per_dn * 10 ** (-0.4 * air_mag))
 
     def _expected(self, number: int) -> Expected:
-        session, shot = self.session, self.session.shots[number]
+        session = self.session
+        shot = self.session.shots[number]
         width, height = shot.photo.size_px
         x, y = session.camera.pointings[number].places_px(session.camera.camera, shot.sky.vectors)
         with np.errstate(invalid="ignore"):
@@ -314,10 +322,13 @@ class Judge:
     def _rows(self, number: int, expected: Expected) -> list[StarRow]:
         """Rows of the stars that are seen, and of those that should be."""
         shot = self.session.shots[number]
-        sky, found = shot.sky, shot.found
+        sky = shot.sky
+        found = shot.found
         _, double, variable = sky.within(shot.star)
         place = {star: k for k, star in enumerate(expected.star.tolist())}
-        v_mag, bv_mag, hip = sky.v_mag, sky.bv_mag, sky.hip
+        v_mag = sky.v_mag
+        bv_mag = sky.bv_mag
+        hip = sky.hip
         kinds = {
             "saturated": shot.saturated,
             "blended": shot.blended,
@@ -329,7 +340,9 @@ class Judge:
             x, y, dn, sigma = (float(value) for value in seen)
             k = place[star]
             predicted = float(expected.x_px[k]), float(expected.y_px[k])
-            light, v, bv = float(expected.dn[k]), float(v_mag[star]), float(bv_mag[star])
+            light = float(expected.dn[k])
+            v = float(v_mag[star])
+            bv = float(bv_mag[star])
             return StarRow(
                 star,
                 int(hip[star]),
@@ -356,13 +369,12 @@ class Judge:
             float(np.median(self.session.pixels.variance_dn2(shot.level.level))) * NEFF_PX
         )
         width, height = shot.photo.size_px
-        near, sources = (
-            _saturated(shot),
-            cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])),
-        )
+        near = _saturated(shot)
+        sources = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
         seen = set(shot.star.tolist())
         for star in expected.star[expected.dn > EXPECTED_SNR * noise].tolist():
-            x, y = expected.x_px[place[star]], expected.y_px[place[star]]
+            x = expected.x_px[place[star]]
+            y = expected.y_px[place[star]]
             inside = (
                 2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX
                 and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
@@ -379,17 +391,19 @@ class Judge:
         """Every source with its explanation: a planet, a trail, a star, the detector, or a
         bright star's light.
         """
-        session, shot = self.session, self.session.shots[number]
-        sources, sky = shot.sources, shot.sky
-        tree = (
-            cKDTree(np.column_stack([expected.x_px, expected.y_px])) if len(expected.star) else None
-        )
-        planets, satellites = (
-            self._planets(number),
-            self._satellites(number) if sources.trail.any() else {},
-        )
+        session = self.session
+        shot = self.session.shots[number]
+        sources = shot.sources
+        sky = shot.sky
+        if len(expected.star):
+            tree = cKDTree(np.column_stack([expected.x_px, expected.y_px]))
+        else:
+            tree = None
+        planets = self._planets(number)
+        satellites = self._satellites(number) if sources.trail.any() else {}
         pixel_dn = math.sqrt(float(np.median(session.pixels.variance_dn2(shot.level.level))))
-        near, hot = _saturated(shot), ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
+        near = _saturated(shot)
+        hot = ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
         height, width = light_sigma.shape
         trails = [
             (sources.x_px[k], sources.y_px[k], sources.length_px[k] / 2 + MASK_PX)
@@ -442,12 +456,12 @@ class Judge:
         shot = self.session.shots[number]
         if shot.photo.t_ns is None:
             return {}
-        seen = planets_seen(shot.photo.t_ns)
+        planets = planets_seen(shot.photo.t_ns)
         camera = self.session.camera
-        x, y = camera.pointings[number].places_px(camera.camera, np.array(list(seen.values())))
+        x, y = camera.pointings[number].places_px(camera.camera, np.array(list(planets.values())))
         return {
             n: (float(a), float(b))
-            for n, a, b in zip(seen, x, y, strict=True)
+            for n, a, b in zip(planets, x, y, strict=True)
             if math.isfinite(a) and math.isfinite(b)
         }
 
@@ -455,32 +469,32 @@ class Judge:
         """Places of satellites in the middle of the exposure, by the bench's list; none without
         a list, a site and a date.
         """
-        file, photo = self.session.file, self.session.shots[number].photo
-        config, camera = file.config, self.session.camera
+        file = self.session.file
+        photo = self.session.shots[number].photo
+        config = file.config
+        camera = self.session.camera
         if config.sky.bodies.satellites is None or config.site is None or photo.t_ns is None:
             return {}
         utc = f"{np.datetime64(photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
         sky = msgspec.structs.replace(
             config.sky, epoch_utc=utc, epoch_jyear=self.session.shots[number].sky.epoch_jyear
         )
-        moving, pointing = (
-            bench_moving(msgspec.structs.replace(config, sky=sky), file.folder),
-            camera.pointings[number],
-        )
+        moving = bench_moving(msgspec.structs.replace(config, sky=sky), file.folder)
+        pointing = camera.pointings[number]
         if moving is None or moving.satellites is None:
             return {}
         moving.air = self.session.air
-        seen = moving.passing(
+        passing = moving.passing(
             Cone(pointing.boresight, camera.camera.field_radius_rad(0.0), photo.exposure_s or 0.0),
             0,
         )
-        if seen is None:
+        if passing is None:
             return {}
-        directions = seen.directions(slice(None), np.zeros(len(seen)))
+        directions = passing.directions(slice(None), np.zeros(len(passing)))
         x, y = camera.camera.project(directions @ to_matrix(pointing.q_icrs_to_cam).T)
         return {
             moving.satellites.names[k]: (float(a), float(b))
-            for k, a, b in zip(seen.index, x, y, strict=True)
+            for k, a, b in zip(passing.index, x, y, strict=True)
         }
 
     def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
@@ -501,10 +515,8 @@ class Judge:
         places = np.column_stack([shot.found.x_px, shot.found.y_px])[shot.clean]
         near = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])).query(places)[1]
         depth = shot.sky.v_mag[shot.star[shot.clean]] + 2.5 * np.log10(shot.sources.snr[near])
-        reached, v_mag = (
-            float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR),
-            shot.sky.v_mag[expected.star],
-        )
+        reached = float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR)
+        v_mag = shot.sky.v_mag[expected.star]
         every = float((v_mag <= complete).sum()) * 10 ** (
             (COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * sine) * (reached - complete)
         )
@@ -518,7 +530,8 @@ class Judge:
         """How far off the date is by the stars that move fastest over the image; None without
         stars.
         """
-        shot, session = self.session.shots[number], self.session
+        shot = self.session.shots[number]
+        session = self.session
         use = np.flatnonzero(shot.clean)
         if not len(use):
             return None
@@ -527,7 +540,8 @@ class Judge:
         later = unit_vectors_icrs(some, shot.sky.epoch_jyear + 1) - unit_vectors_icrs(
             some, shot.sky.epoch_jyear
         )
-        pointing, camera = session.camera.pointings[number], session.camera.camera
+        pointing = session.camera.pointings[number]
+        camera = session.camera.camera
         vectors = shot.sky.vectors[star]
         here, there = (
             np.column_stack(pointing.places_px(camera, part)) for part in (vectors, vectors + later)
@@ -543,13 +557,19 @@ class Judge:
 
 
 def _rms(values: FloatArray) -> float:
-    return math.sqrt(float((values**2).mean())) if len(values) else math.nan
+    if len(values):
+        return math.sqrt(float((values**2).mean()))
+    return math.nan
 
 
 def _saturated(shot: Shot) -> Callable[[float, float], bool]:
     """Whether a place is near a saturated star."""
-    mask = np.zeros(0, dtype=bool) if shot.saturated is None else shot.saturated
-    x, y = shot.found.x_px[mask], shot.found.y_px[mask]
+    if shot.saturated is None:
+        mask = np.zeros(0, dtype=bool)
+    else:
+        mask = shot.saturated
+    x = shot.found.x_px[mask]
+    y = shot.found.y_px[mask]
     return lambda a, b: bool((np.hypot(x - a, y - b) < HALO_PX).any())
 
 
@@ -563,7 +583,8 @@ def _dim_regions(
     cells: dict[tuple[int, int], list[StarRow]] = {}
 
     def cell(row: StarRow) -> tuple[int, int]:
-        across, down = row.x_predicted_px / width, row.y_predicted_px / height
+        across = row.x_predicted_px / width
+        down = row.y_predicted_px / height
         return min(int(CELLS * max(down, 0)), CELLS - 1), min(
             int(CELLS * max(across, 0)), CELLS - 1
         )
@@ -577,11 +598,10 @@ def _dim_regions(
     for row in trusted:
         cells.setdefault(cell(row), []).append(row)
     dim: dict[tuple[int, int], tuple[int, int, float]] = {}
-    spread = (
-        MAD * float(np.median(np.abs(every)))
-        if len(every := np.array([r.off_mag for r in trusted if r.dn > 0]))
-        else 0.1
-    )
+    if len(every := np.array([r.off_mag for r in trusted if r.dn > 0])):
+        spread = MAD * float(np.median(np.abs(every)))
+    else:
+        spread = 0.1
     for place, some in cells.items():
         lost = sum("missing" in r.flags for r in some)
         off = np.array([r.off_mag for r in some if r.dn > 0])
@@ -595,12 +615,16 @@ def _dim_regions(
     for (down, across), found in dim.items():
         name = f"{('upper', 'lower')[2 * down >= CELLS]} {('left', 'right')[2 * across >= CELLS]}"
         parts.setdefault(name, []).append(found)
-    words = []
+    region_texts = []
     for name, every_cell in parts.items():
-        lost, count = sum(one[0] for one in every_cell), sum(one[1] for one in every_cell)
-        depth = [one[2] for one in every_cell if math.isfinite(one[2])]
-        deep = f", those seen {np.median(depth):.2f} mag too faint" if depth else ""
-        words.append(
+        lost = sum(cell_counts[0] for cell_counts in every_cell)
+        count = sum(cell_counts[1] for cell_counts in every_cell)
+        depth = [cell_counts[2] for cell_counts in every_cell if math.isfinite(cell_counts[2])]
+        if depth:
+            deep = f", those seen {np.median(depth):.2f} mag too faint"
+        else:
+            deep = ""
+        region_texts.append(
             f"{name}: {lost} of {count} stars are missing{deep}: cloud, an obstacle, or vignetting"
         )
     faint = max(DIM_MAG, DIM_SIGMAS * spread)
@@ -610,4 +634,4 @@ def _dim_regions(
         beside = any((down + a, across + b) in dim for a in (-1, 0, 1) for b in (-1, 0, 1))
         return beside and row.off_mag > faint
 
-    return words, in_dim
+    return region_texts, in_dim

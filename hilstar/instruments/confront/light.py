@@ -121,20 +121,28 @@ def fit_light(
     correction = _correction(stars, magnitudes, np.column_stack([ones, r2]), use)
     base = magnitudes(correction)
     off = stars.instrument_mag - base
-    chosen, best = "even", math.inf
+    chosen = "even"
+    best = math.inf
     for name, columns in vignetting.items():
         held_out = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
         if held_out < GAIN * best:
-            best, chosen = held_out, name
+            best = held_out
+            chosen = name
     # a mosaic's planes have a colour each beside the one quantum efficiency
-    bv, planes = np.nan_to_num(stars.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG, np.unique(stars.plane)
-    own = [bv * (stars.plane == plane) for plane in planes if len(planes) > 1]
-    found = _robust(np.column_stack([ones, *vignetting[chosen], *own]), off, stars.sigma_mag, use)
-    terms = (*found.values[images : len(found.values) - len(own)].tolist(), 0.0, 0.0)[:2]
-    colours, colour_terms = np.zeros(images), {}
-    for k, plane in enumerate(planes if own else ()):
-        colours[np.unique(stars.image[stars.plane == plane])] = found.values[
-            len(found.values) - len(own) + k
+    bv = np.nan_to_num(stars.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
+    planes = np.unique(stars.plane)
+    own_columns = [bv * (stars.plane == plane) for plane in planes if len(planes) > 1]
+    solution = _robust(
+        np.column_stack([ones, *vignetting[chosen], *own_columns]), off, stars.sigma_mag, use
+    )
+    terms = (*solution.values[images : len(solution.values) - len(own_columns)].tolist(), 0.0, 0.0)[
+        :2
+    ]
+    colours = np.zeros(images)
+    colour_terms = {}
+    for k, plane in enumerate(planes if own_columns else ()):
+        colours[np.unique(stars.image[stars.plane == plane])] = solution.values[
+            len(solution.values) - len(own_columns) + k
         ]
         here = use & (stars.plane == plane)
         colour_terms[" rgb"[plane]] = float(
@@ -144,14 +152,14 @@ def fit_light(
     sigma = {name: about_v.sigma[k] for k, name in enumerate(("linearity", "colour_term"))}
     sigma |= {"zero_point_mag": float(about_v.sigma[2 : 2 + images].mean())}
     return LightFit(
-        offsets_mag=found.values[:images],
+        offsets_mag=solution.values[:images],
         vignetting_mag=(terms[0], terms[1]),
         correction=correction,
         zero_point_mag=-float(about_v.values[2 : 2 + images].mean()),
         colour_term=float(about_v.values[1]),
         linearity=float(about_v.values[0]),
         sigma=sigma,
-        mag=base + found.model - ones @ found.values[:images],
+        mag=base + solution.model - ones @ solution.values[:images],
         colours=colours,
         colour_terms=colour_terms,
     )
@@ -166,10 +174,10 @@ def with_extinction(
     A photograph's offset counts by its stars' scatter and by CLOUD_MAG, by which skies differ. With
     a `known` extinction the slope is what is left of it.
     """
-    found = replace(light, masses=tuple(masses))
-    x = np.array([np.nan if one is None else one for one in masses])
+    light_found = replace(light, masses=tuple(masses))
+    x = np.array([np.nan if air_mass is None else air_mass for air_mass in masses])
     if not np.isfinite(x).all() or len(x) < 3 or np.ptp(x) < MIN_MASSES:
-        return found
+        return light_found
     off = light.offsets_mag[stars.image] + light.mag - stars.instrument_mag
     count = np.bincount(stars.image[stars.clean], minlength=len(x))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(off[stars.clean])))
@@ -177,9 +185,14 @@ def with_extinction(
     design = np.column_stack([x, np.ones(len(x))]) / sigma[:, None]
     slope, _ = np.linalg.lstsq(design, light.offsets_mag / sigma, rcond=None)[0]
     error = math.sqrt(float(np.linalg.inv(design.T @ design)[0, 0]))
-    name = "extinction_beyond_table" if known else "extinction"
+    if known:
+        name = "extinction_beyond_table"
+    else:
+        name = "extinction"
     return replace(
-        found, extinction_mag=float(slope), sigma=light.sigma | {f"{name}_mag_per_air_mass": error}
+        light_found,
+        extinction_mag=float(slope),
+        sigma=light.sigma | {f"{name}_mag_per_air_mass": error},
     )
 
 
@@ -193,8 +206,8 @@ def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
         return clean
     plain = _robust(ones, stars.instrument_mag - stars.v_mag, stars.sigma_mag, bright)
     expected_dn = 10 ** (-0.4 * (stars.v_mag + ones @ plain.values))
-    found = clean & (expected_dn > TRUSTED_SNR * np.median(stars.sigma_dn[bright]))
-    return found if found.sum() >= MIN_STARS else clean
+    is_trusted = clean & (expected_dn > TRUSTED_SNR * np.median(stars.sigma_dn[bright]))
+    return is_trusted if is_trusted.sum() >= MIN_STARS else clean
 
 
 def _correction(
@@ -204,25 +217,29 @@ def _correction(
     count = sum(int(use.sum()) >= least + plain.shape[1] for least in STARS_FOR_CORRECTION)
     if not count or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
         return NO_CORRECTION
-    weight, target = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use], stars.instrument_mag[use]
+    weight = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use]
+    target = stars.instrument_mag[use]
     plain = plain[use]
 
     def loss(values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Huber's loss and a weak prior; the residuals in sigmas, and the other columns'
         coefficients.
         """
-        off, kept = target - magnitudes(_pair(values))[use], np.ones(len(target))
+        off = target - magnitudes(_pair(values))[use]
+        weights = np.ones(len(target))
         for _ in range(CORRECTION_ROUNDS):
-            rows = plain * (np.sqrt(kept) / weight)[:, None]
-            left = (
-                off - plain @ np.linalg.lstsq(rows, off * np.sqrt(kept) / weight, rcond=None)[0]
+            rows = plain * (np.sqrt(weights) / weight)[:, None]
+            residual = (
+                off - plain @ np.linalg.lstsq(rows, off * np.sqrt(weights) / weight, rcond=None)[0]
             ) / weight
-            kept = np.minimum(1.0, CORRECTION_HUBER / np.maximum(np.abs(left), CORRECTION_HUBER))
-        size = np.abs(left)
+            weights = np.minimum(
+                1.0, CORRECTION_HUBER / np.maximum(np.abs(residual), CORRECTION_HUBER)
+            )
+        size = np.abs(residual)
         huber = np.where(
             size < CORRECTION_HUBER, size**2 / 2, CORRECTION_HUBER * (size - CORRECTION_HUBER / 2)
         )
-        return float(huber.sum() + ((values / CORRECTION_PRIOR) ** 2).sum() / 2), left, kept
+        return float(huber.sum() + ((values / CORRECTION_PRIOR) ** 2).sum() / 2), residual, weights
 
     values: FloatArray = np.zeros(2)
     best, off, kept = loss(values)
@@ -232,7 +249,9 @@ def _correction(
             magnitudes(_pair(values + step))[use] for step in CORRECTION_STEP * np.eye(2)[:count]
         ]
         slopes = (
-            np.column_stack([*plain.T, *((one - base) / CORRECTION_STEP for one in moved)])
+            np.column_stack(
+                [*plain.T, *((moved_loss - base) / CORRECTION_STEP for moved_loss in moved)]
+            )
             / weight[:, None]
         )
         prior = np.zeros(slopes.shape[1])
@@ -292,8 +311,8 @@ def _offsets_alone(stars: StarLight, images: int, base: FloatArray, held: LightF
     shape = held.vignetting_mag[0] * stars.radius2 + held.vignetting_mag[1] * stars.radius2**2
     off = stars.instrument_mag - base - shape
     ones = np.eye(images)[stars.image]
-    found = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
-    return replace(held, offsets_mag=found.values, mag=base + shape, colours=np.zeros(images))
+    solution = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
+    return replace(held, offsets_mag=solution.values, mag=base + shape, colours=np.zeros(images))
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,26 +325,27 @@ class _Robust:
 
 def _robust(design: FloatArray, target: FloatArray, sigma: FloatArray, use: BoolArray) -> _Robust:
     """Least squares without what lies far off; its errors by the scatter that is left."""
-    kept, floor = use & np.isfinite(target), 0.05
+    is_kept = use & np.isfinite(target)
+    floor = 0.05
     values: FloatArray = np.zeros(design.shape[1])
     covariance = np.full((design.shape[1],) * 2, np.nan)
     for _ in range(ROUNDS):
-        if kept.sum() <= design.shape[1]:
+        if is_kept.sum() <= design.shape[1]:
             break
-        weight = 1 / np.hypot(sigma, floor)[kept]
-        rows = design[kept] * weight[:, None]
+        weight = 1 / np.hypot(sigma, floor)[is_kept]
+        rows = design[is_kept] * weight[:, None]
         values = np.asarray(
-            np.linalg.lstsq(rows, target[kept] * weight, rcond=None)[0], dtype=np.float64
+            np.linalg.lstsq(rows, target[is_kept] * weight, rcond=None)[0], dtype=np.float64
         )
         off = target - design @ values
         spread = (
             MAD_TO_SIGMA
-            * float(np.median(np.abs(off[kept])))
-            * math.sqrt(kept.sum() / (kept.sum() - design.shape[1]))
+            * float(np.median(np.abs(off[is_kept])))
+            * math.sqrt(is_kept.sum() / (is_kept.sum() - design.shape[1]))
         )
-        floor = math.sqrt(max(spread**2 - float(np.median(sigma[kept])) ** 2, 1e-6))
+        floor = math.sqrt(max(spread**2 - float(np.median(sigma[is_kept])) ** 2, 1e-6))
         covariance = np.linalg.pinv(rows.T @ rows)
-        kept = use & (np.abs(off) < PATTERN_CLIP * np.hypot(sigma, max(spread, 0.01)))
+        is_kept = use & (np.abs(off) < PATTERN_CLIP * np.hypot(sigma, max(spread, 0.01)))
     model = design @ values
     return _Robust(values, np.sqrt(np.maximum(np.diag(covariance), 0)), model, target - model)
 
@@ -337,5 +357,7 @@ def _held_out(design: FloatArray, target: FloatArray, sigma: FloatArray, use: Bo
     for fold in range(FOLDS):
         out = use & (number % FOLDS == fold)
         off[out] = _robust(design, target, sigma, use & ~out).off[out]
-    found = np.clip(off[use], -0.5, 0.5)
-    return math.sqrt(float((found**2).mean())) if len(found) else math.nan
+    clipped_mag = np.clip(off[use], -0.5, 0.5)
+    if len(clipped_mag):
+        return math.sqrt(float((clipped_mag**2).mean()))
+    return math.nan

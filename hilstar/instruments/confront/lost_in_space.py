@@ -88,30 +88,32 @@ def solve_lost(
     if near is not None:
         reach = 2.5 * math.atan(field.diagonal_px / 2 / focal_length_px)
         rows = np.flatnonzero(vectors @ near > math.cos(min(reach, math.pi)))
-        found = _solved(
+        solution = _solved(
             field,
             focal_length_px,
             vectors[rows],
             _triangles_of_sky(vectors[rows], smaller_rad, near, reach),
         )
-        return None if found is None else replace(found, star=rows[found.star])
-    kept = _KEPT.get(smaller_rad)
+        if solution is None:
+            return None
+        return replace(solution, star=rows[solution.star])
+    table = _KEPT.get(smaller_rad)
     if (
-        kept is None
-        or kept[0].shape != vectors.shape
-        or np.abs(kept[0][:KEPT_STARS] - vectors[:KEPT_STARS]).max() > KEPT_RAD
+        table is None
+        or table[0].shape != vectors.shape
+        or np.abs(table[0][:KEPT_STARS] - vectors[:KEPT_STARS]).max() > KEPT_RAD
     ):
-        kept = vectors, _triangles_of_sky(vectors, smaller_rad)
+        table = vectors, _triangles_of_sky(vectors, smaller_rad)
         _KEPT.clear()
-        _KEPT[smaller_rad] = kept
-    return _solved(field, focal_length_px, vectors, kept[1])
+        _KEPT[smaller_rad] = table
+    return _solved(field, focal_length_px, vectors, table[1])
 
 
 def _solved(
     field: SourceField, focal_length_px: float, vectors: FloatArray, sky: Triangles
 ) -> SolvedField | None:
     tries = (_by_hypothesis(field, focal_length_px * times, vectors, sky) for times in HYPOTHESES)
-    return next((found for found in tries if found is not None), None)
+    return next((solution for solution in tries if solution is not None), None)
 
 
 def _triangles_of_sky(
@@ -125,7 +127,8 @@ def _triangles_of_sky(
     area_sr = 2 * math.pi * (1 - math.cos(radius_rad))
     bright = vectors[: min(len(vectors), math.ceil(2.5 * STARS_A_CIRCLE * 4 * math.pi / area_sr))]
     number = np.arange(circles) + 0.5
-    z, azimuth = 1 - 2 * number / circles, number * math.pi * (3 - math.sqrt(5))
+    z = 1 - 2 * number / circles
+    azimuth = number * math.pi * (3 - math.sqrt(5))
     level = np.sqrt(1 - z * z)
     centres = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
     if near is not None:
@@ -170,21 +173,20 @@ def _image_triples(field: SourceField) -> Iterator[tuple[int, int, int]]:
     first.
     """
     radius = CIRCLE * min(field.width_px, field.height_px)
-    ways = [
-        np.arange(-(size / 2 - radius), size / 2 - radius + 1, max(radius / 2, 1.0))
-        for size in (field.width_px, field.height_px)
-    ]
-    seen: set[tuple[int, int, int]] = set()
-    found: list[tuple[int, int, int]] = []
+    ways = []
+    for size in (field.width_px, field.height_px):
+        ways.append(np.arange(-(size / 2 - radius), size / 2 - radius + 1, max(radius / 2, 1.0)))
+    known_triples: set[tuple[int, int, int]] = set()
+    triples: list[tuple[int, int, int]] = []
     for x, y in itertools.product(*ways):
         near = np.flatnonzero(
             np.hypot(field.places_px[:, 0] - x, field.places_px[:, 1] - y) < radius
         )[:SOURCES_A_CIRCLE]
         for triple in itertools.combinations(near.tolist(), 3):
-            if triple not in seen:
-                seen.add(triple)
-                found.append(triple)
-    yield from sorted(found, key=sum)
+            if triple not in known_triples:
+                known_triples.add(triple)
+                triples.append(triple)
+    yield from sorted(triples, key=sum)
 
 
 def _by_hypothesis(
@@ -207,9 +209,9 @@ def _by_hypothesis(
             if tried > MAX_CANDIDATES:
                 return None
             scale = math.exp(keys[row, 0] - tree.data[candidate, 0] / STRETCH[0])
-            found = proof.of(mine[row], triples[candidate], focal_px * scale)
-            if found is not None:
-                return found
+            solution = proof.of(mine[row], triples[candidate], focal_px * scale)
+            if solution is not None:
+                return solution
     return None
 
 
@@ -217,7 +219,8 @@ class _Proof:
     """Whether the other bright stars of a field lie on sources too."""
 
     def __init__(self, field: SourceField, vectors: FloatArray) -> None:
-        self.field, self.vectors = field, vectors
+        self.field = field
+        self.vectors = vectors
         self.places = field.places_px[:MAX_SOURCES]
         self.tree = cKDTree(self.places)
         self.radius_px = NEAR * field.diagonal_px
@@ -229,11 +232,12 @@ class _Proof:
     def of(self, sources: IntArray, stars: IntArray, focal_px: float) -> SolvedField | None:
         """The attitude by three pairs, where it holds."""
         matrix = turned(self.field.rays(focal_px)[sources], self.vectors[stars])
-        seen = self._seen(matrix, focal_px)
-        if len(seen) < MIN_MATCHED:
+        in_image = self._seen(matrix, focal_px)
+        if len(in_image) < MIN_MATCHED:
             return None
-        star, source = self._pairs(seen, matrix, focal_px)
-        more, of = len(star) - 3, len(seen) - 3
+        star, source = self._pairs(in_image, matrix, focal_px)
+        more = len(star) - 3
+        of = len(in_image) - 3
         if len(star) < MIN_MATCHED or betainc(more, of - more + 1, self.chance) > MAX_CHANCE:
             return None
         for _ in range(3):
@@ -262,8 +266,8 @@ class _Proof:
     ) -> tuple[IntArray, IntArray]:
         """Stars and the sources on which they lie, each once."""
         places = self._places(self.vectors[seen], matrix, focal_px)
-        one, source = nearest_once(self.tree, places, self.radius_px)
-        return seen[one], source
+        star_index, source = nearest_once(self.tree, places, self.radius_px)
+        return seen[star_index], source
 
 
 def nearest_once(
@@ -293,7 +297,7 @@ def _refined(
     cam = vectors @ matrix.T
     plane = cam[:, :2] / cam[:, 2:]
     plane -= plane.mean(axis=0)
-    seen = places - places.mean(axis=0)
-    focal_px = float(np.sqrt((seen**2).sum() / (plane**2).sum()))
+    centred_px = places - places.mean(axis=0)
+    focal_px = float(np.sqrt((centred_px**2).sum() / (plane**2).sum()))
     rays = np.column_stack([places / focal_px, np.ones(len(places))])
     return turned(rays / np.linalg.norm(rays, axis=1, keepdims=True), vectors), focal_px

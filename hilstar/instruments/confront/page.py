@@ -69,12 +69,15 @@ def page_pictures(session: Session, verdict: PhotoVerdict) -> Pictures:
     """The pictures of a verdict, before its arrays are dropped."""
     shot = verdict.shot
     noise = np.sqrt(session.pixels.variance_dn2(shot.level.level))
-    seen = [(part - shot.level.level) / noise for part in (shot.photo.dn, verdict.predicted)]
+    in_sigmas = [(part - shot.level.level) / noise for part in (shot.photo.dn, verdict.predicted)]
     top = math.asinh(WHITE)
-    greys = [255 * np.clip(np.arcsinh(np.clip(part - BLACK, 0, None)) / top, 0, 1) for part in seen]
+    greys = [
+        255 * np.clip(np.arcsinh(np.clip(part - BLACK, 0, None)) / top, 0, 1) for part in in_sigmas
+    ]
     greys.append(255 * np.clip(verdict.residual / (2 * RESIDUAL) + 0.5, 0, 1))
     height, width = verdict.residual.shape
-    rows, columns = np.linspace(0, height, 13).astype(int), np.linspace(0, width, 17).astype(int)
+    rows = np.linspace(0, height, 13).astype(int)
+    columns = np.linspace(0, width, 17).astype(int)
     clipped = np.minimum(verdict.residual**2, 25.0)
     sums = np.add.reduceat(np.add.reduceat(clipped, rows[:-1], axis=0), columns[:-1], axis=1)
     return Pictures(
@@ -112,12 +115,14 @@ def _verdict(found: Confronted) -> Verdict:
 
 def _figures(verdicts: Sequence[PhotoVerdict]) -> Iterator[KeyFigure]:
     """Stars, how far they are off, and what is missing on either side; of all photographs."""
-    counted = sum(one.counted for one in verdicts)
+    counted = sum(verdict.counted for verdict in verdicts)
     yield KeyFigure(str(counted), f"stars to V = {BRIGHT_V_MAG:g}")
-    yield KeyFigure(f"{_worst(one.rms_px for one in verdicts)} px", "rms off their places")
-    yield KeyFigure(f"{_worst(one.rms_mag for one in verdicts)} mag", "rms off their light")
-    yield _count(sum(len(one.unexplained) for one in verdicts), "sources that nothing explains")
-    yield _count(sum(len(one.missing) for one in verdicts), "stars that are missing")
+    yield KeyFigure(f"{_worst(verdict.rms_px for verdict in verdicts)} px", "rms off their places")
+    yield KeyFigure(f"{_worst(verdict.rms_mag for verdict in verdicts)} mag", "rms off their light")
+    yield _count(
+        sum(len(verdict.unexplained) for verdict in verdicts), "sources that nothing explains"
+    )
+    yield _count(sum(len(verdict.missing) for verdict in verdicts), "stars that are missing")
 
 
 def _worst(values: Iterable[float]) -> str:
@@ -135,8 +140,8 @@ def _count(count: int, of: str) -> KeyFigure:
 
 def _cards(found: Confronted, pictures: Sequence[Pictures]) -> Iterator[Card]:
     """The photographs with their stars, the charts, what is odd; then how it was found."""
-    for one, views in zip(found.verdicts, pictures, strict=True):
-        yield Card(one.shot.photo.name, words=[_frame(one, views)])
+    for verdict, views in zip(found.verdicts, pictures, strict=True):
+        yield Card(verdict.shot.photo.name, words=[_frame(verdict, views)])
     for title, chart in _charts(found, pictures):
         yield Card(title, words=[chart])
     yield from _lists(found.verdicts)
@@ -216,16 +221,18 @@ def _frame(verdict: PhotoVerdict, pictures: Pictures) -> str:
 
 def _brightest(verdict: PhotoVerdict) -> list[StarRow]:
     """The brightest stars that were seen."""
-    seen = [row for row in verdict.stars if row.dn > 0]
-    return sorted(seen, key=lambda row: row.v_mag)[:MAX_NAMED]
+    visible = [row for row in verdict.stars if row.dn > 0]
+    return sorted(visible, key=lambda row: row.v_mag)[:MAX_NAMED]
 
 
 def _name(row: StarRow, width: int) -> str:
     """A star's name beside it; at the left where there is no room at the right."""
     size = width / NAME_SIZE
-    x, anchor = row.x_px + size, "start"
+    x = row.x_px + size
+    anchor = "start"
     if row.x_px > 0.85 * width:
-        x, anchor = row.x_px - size, "end"
+        x = row.x_px - size
+        anchor = "end"
     place = f'x="{x:.0f}" y="{row.y_px + size / 3:.0f}" font-size="{size:.1f}"'
     return f'<text {place} text-anchor="{anchor}" fill="#ffd24a">{escaped(row.name)}</text>'
 
@@ -238,7 +245,10 @@ def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, 
         if row.dn > 0 and row.dn_predicted > 0
     ]
     good = [row for row in rows if not NOT_COUNTED & set(row.flags)]
-    charts = [("Flux and colour", _flux(found, good))] if good else []
+    if good:
+        charts = [("Flux and colour", _flux(found, good))]
+    else:
+        charts = []
     if good:
         charts.append(("Places", _places(good)))
     charts.append(("Point spread function", _psf_grid(found.session)))
@@ -255,7 +265,10 @@ def _flux(found: Confronted, rows: Sequence[Any]) -> str:
     )
     light = found.session.light
     counted = np.array([row.counted for row in rows])
-    rms = math.sqrt(float((off[counted] ** 2).mean())) if counted.any() else math.nan
+    if counted.any():
+        rms = math.sqrt(float((off[counted] ** 2).mean()))
+    else:
+        rms = math.nan
     finding = f"Stars to V = 6.5 are {rms:.3f} mag rms off their prediction"
     note = (
         "Stars that stand alone and are not saturated. Filled: to V = 6.5. Off: seen less"
@@ -296,7 +309,10 @@ def _places(rows: Sequence[Any]) -> str:
     )
     dx = np.array([row.x_px - row.x_predicted_px for row in some])
     dy = np.array([row.y_px - row.y_predicted_px for row in some])
-    rms = math.sqrt(float((dx**2 + dy**2).mean() / 2)) if some else math.nan
+    if some:
+        rms = math.sqrt(float((dx**2 + dy**2).mean() / 2))
+    else:
+        rms = math.nan
     with panels_of(
         f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places",
         height_inch=4.6,
@@ -360,7 +376,7 @@ def _transfer(session: Session) -> str:
 
 
 def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -> str:
-    chi2 = [one.background_chi2 for one in verdicts]
+    chi2 = [verdict.background_chi2 for verdict in verdicts]
     columns = min(len(verdicts), 4)
     rows = math.ceil(len(verdicts) / columns)
     finding = f"The background's chi² is {min(chi2):.3f} to {max(chi2):.3f}"
@@ -371,12 +387,12 @@ def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -
     with panels_of(
         finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows
     ) as panels:
-        for axes, one, views in zip(panels, verdicts, pictures, strict=False):
+        for axes, verdict, views in zip(panels, verdicts, pictures, strict=False):
             drawn = axes.imshow(views.chi2_map, vmin=0.5, vmax=2.0, cmap="RdBu_r", aspect="auto")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.grid(visible=False)
-            axes.set_xlabel(f"photograph {one.number + 1}")
+            axes.set_xlabel(f"photograph {verdict.number + 1}")
         for axes in panels[len(verdicts) :]:
             axes.set_axis_off()
         panels[0].figure.colorbar(drawn, ax=panels, label="chi²", shrink=0.7)

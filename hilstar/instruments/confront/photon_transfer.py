@@ -114,7 +114,10 @@ def fit_pixels(
     """
     if not len(points):
         note = "no part of the background is free of sources: the detector is the bench file's"
-        offset = assumed.offset_dn if pedestal is None else pedestal[0]
+        if pedestal is None:
+            offset = assumed.offset_dn
+        else:
+            offset = pedestal[0]
         bench = _of_bench(assumed, step_dn, points, pattern)
         return replace(bench, pedestal_dn=offset, notes=(note,))
     level, variance = points.T
@@ -140,7 +143,8 @@ def _of_bench(
     points: FloatArray,
     pattern: FixedPattern,
 ) -> PixelFit:
-    gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
+    gain = assumed.gain_e_per_dn
+    read_e = assumed.read_noise_e
     return PixelFit(gain, assumed.offset_dn, read_e, step_dn, {}, points, (), pattern)
 
 
@@ -328,7 +332,10 @@ def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
         normal = np.linalg.pinv((design / size).T @ (design / size))
         sigma = spread * np.sqrt(np.diag(normal)) / size
         near = np.abs(off) < CLIP * spread * scale
-    squares = (float(values[2]), float(sigma[2])) if square else (0.0, 0.0)
+    if square:
+        squares = (float(values[2]), float(sigma[2]))
+    else:
+        squares = (0.0, 0.0)
     return _Curve(
         float(values[0]), float(values[1]), squares[0], float(sigma[0]), float(sigma[1]), squares[1]
     )
@@ -373,9 +380,8 @@ def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[floa
         for k, p in enumerate(parts)
         if max(m := medians[:k] + medians[k + 1 :]) > MIN_LEVEL_RANGE * min(m)
     ]
-    sigma = (
-        float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1))
-        if len(usable) > 1
-        else abs(whole) / 2
-    )
+    if len(usable) > 1:
+        sigma = float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1))
+    else:
+        sigma = abs(whole) / 2
     return whole, max(sigma, 0.01 * min(medians))

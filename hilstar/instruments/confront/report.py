@@ -40,13 +40,15 @@ class Confronted:
     @property
     def figures(self) -> dict[str, Any]:
         """The keys of --json."""
-        camera, session = self.session.camera, self.session
+        camera = self.session.camera
+        session = self.session
         lens = camera.camera.lens
         k1, k2, _ = lens.radial if lens else (0.0, 0.0, 0.0)
         p1, p2 = lens.tangential if lens else (0.0, 0.0)
         sigma = camera.sigma
         focal = camera.camera.focal_length_px
-        light, pixels = session.light, session.pixels
+        light = session.light
+        pixels = session.pixels
         return {
             "images": [_image_figures(session, verdict) for verdict in self.verdicts],
             "camera": {
@@ -94,8 +96,13 @@ class Confronted:
                     "stars": self.excess.stars,
                     "rms_px": self.excess.rms_px,
                     "rms_mag": self.excess.rms_mag,
-                    "light_mag": {one.name: _number(one.rms) for one in self.excess.light},
-                    "places_px": {one.name: _number(one.rms) for one in self.excess.places},
+                    "light_mag": {
+                        light_part.name: _number(light_part.rms) for light_part in self.excess.light
+                    },
+                    "places_px": {
+                        light_part.name: _number(light_part.rms)
+                        for light_part in self.excess.places
+                    },
                 }
             ),
             "fixed": session.fixed,
@@ -152,7 +159,8 @@ def sky_v_mag(session: Session, number: int) -> float | None:
     """V of the sky between the stars, mag/arcsec^2, by the zero point of stars; None where it is
     not above the pedestal.
     """
-    pixels, camera = session.pixels, session.camera.camera
+    pixels = session.pixels
+    camera = session.camera.camera
     dn = float(np.median(session.shots[number].level.level)) - pixels.pedestal_dn
     if dn <= 0:
         return None
@@ -182,9 +190,11 @@ def lines_of(
     session: Session, verdicts: Sequence[Verdict], excess: Excess | None, defects: tuple[int, int]
 ) -> list[str]:
     """Verdicts in words: what the simulator explains, and what it does not."""
-    camera, light, pixels = session.camera, session.light, session.pixels
+    camera = session.camera
+    light = session.light
+    pixels = session.pixels
     lens = camera.camera.lens
-    found = [
+    lines = [
         (
             f"lens: {camera.camera.focal_length_px:.2f} px of focal length, k1 ="
             f" {lens.radial[0] if lens else 0:.4f} ({camera.model})"
@@ -200,15 +210,15 @@ def lines_of(
         ),
     ]
     if math.isfinite(pixels.pattern.errors[0]) and not session.fixed:
-        found.append(f"fixed pattern: {pixels.pattern.words()}")
+        lines.append(f"fixed pattern: {pixels.pattern.words()}")
     if not session.fixed:
         zero = (
             f"zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V)"
         )
         zero += "".join(f", {plane} {term:+.3f}" for plane, term in light.colour_terms.items())
-        found.append(f"light: {zero}; {_tone(session)}")
+        lines.append(f"light: {zero}; {_tone(session)}")
     if session.fixed:
-        found.append(
+        lines.append(
             "air: "
             + ", ".join(f"{v:+.2f}" for v in light.offsets_mag - light.offsets_mag.min())
             + " mag dimmer than the clearest"
@@ -216,48 +226,47 @@ def lines_of(
     extinction = extinction_of(session)
     if extinction is not None:
         sigma = next(value for name, value in light.sigma.items() if name.startswith("extinction"))
-        masses = [one for one in light.masses if one is not None]
-        found.append(
+        masses = [air_mass for air_mass in light.masses if air_mass is not None]
+        lines.append(
             f"extinction: {extinction:.3f} +- {sigma:.3f} mag an air mass, over {min(masses):.2f}"
             f" to {max(masses):.2f} of them"
         )
     skies = [v for k in range(len(session.shots)) if (v := sky_v_mag(session, k)) is not None]
     if skies:
-        found.append(
+        lines.append(
             f"sky: V {min(skies):.2f} to {max(skies):.2f} mag/arcsec2, if its spectrum is that of"
             " [site] sky_spectrum"
         )
     if defects[0] or defects[1]:
-        found.append(f"pixels: {defects[0]} hot and {defects[1]} dead, in most of the photographs")
+        lines.append(f"pixels: {defects[0]} hot and {defects[1]} dead, in most of the photographs")
     for verdict in verdicts:
-        found += [
+        lines += [
             f"{verdict.shot.photo.name}: {line}"
             for line in (*verdict.dim, *_beyond(verdict), *_dated(verdict))
         ]
     if excess is not None:
-        found.append(
+        lines.append(
             f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis,"
             f" {excess.rms_mag:.3f} mag"
         )
-    return found
+    return lines
 
 
 def _tone(session: Session) -> str:
     """Whether DN go as light, in words."""
-    power, light = session.power, session.light
+    power = session.power
+    light = session.light
     if power != 1.0:
         return (
             f"a tone curve: DN go as light to the power {power:.3f} (gamma {1 / power:.2f}); other"
             " figures are without it"
         )
     sigma = light.sigma["linearity"]
-    said = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
+    tone_text = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
     bent = abs(light.linearity - 1) > max(LINEAR_OFF, LINEAR_SIGMAS * sigma)
-    return (
-        f"{said}: a tone curve that is no power, which stays in all figures"
-        if bent
-        else f"{said}: no tone curve"
-    )
+    if bent:
+        return f"{tone_text}: a tone curve that is no power, which stays in all figures"
+    return f"{tone_text}: no tone curve"
 
 
 def _beyond(verdict: Verdict) -> Iterator[str]:
@@ -287,11 +296,11 @@ def _dated(verdict: Verdict) -> Iterator[str]:
 
 def failures_of(verdicts: Sequence[Verdict]) -> list[str]:
     """What is beyond the limits of --strict."""
-    found = []
+    failures = []
     for verdict in verdicts:
         name = verdict.shot.photo.name
         if verdict.counted < MIN_STARS_JUDGED:
-            found.append(
+            failures.append(
                 f"{name}: {verdict.counted} clean stars to V = 6.5 are too few to judge by"
             )
         for what, value, limit, unit in (
@@ -299,11 +308,11 @@ def failures_of(verdicts: Sequence[Verdict]) -> list[str]:
             ("light", verdict.rms_mag, MAX_RMS_MAG, "mag"),
         ):
             if value > limit:
-                found.append(f"{name}: {what} are {value:.3f} {unit} rms off, over {limit:g}")
+                failures.append(f"{name}: {what} are {value:.3f} {unit} rms off, over {limit:g}")
         if not CHI2[0] <= verdict.background_chi2 <= CHI2[1]:
-            found.append(
+            failures.append(
                 f"{name}: background chi2 {verdict.background_chi2:.2f} is outside {CHI2[0]:g} to"
                 f" {CHI2[1]:g}"
             )
-        found += [f"{name}: {line}" for line in verdict.dim]
-    return found
+        failures += [f"{name}: {line}" for line in verdict.dim]
+    return failures

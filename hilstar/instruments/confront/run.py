@@ -58,8 +58,8 @@ def confront(
     photos: list[Photograph] = []
     for path in images:
         read = read_photographs(path, file.config.tracker.resolution_px, at_ns)
-        if sum(one.dn.size for one in (*photos, *read)) > MEMORY_PX:
-            read = [replace(one, dn=paged(one.dn)) for one in read]
+        if sum(photograph.dn.size for photograph in (*photos, *read)) > MEMORY_PX:
+            read = [replace(photograph, dn=paged(photograph.dn)) for photograph in read]
         photos += read
     full = max(photo.full_dn for photo in photos)
     photos = [replace(photo, full_dn=full) for photo in photos]
@@ -67,7 +67,10 @@ def confront(
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:
         raise InputError(f"{twice}: two images have this name; give each a name of its own")
-    held = fixed_camera(file, max(photo.step_dn for photo in photos)) if fixed else None
+    if fixed:
+        held = fixed_camera(file, max(photo.step_dn for photo in photos))
+    else:
+        held = None
     try:
         session = run_session(file, photos, _base(file, photos), start, fixed=held)
     except np.linalg.LinAlgError as error:
@@ -76,9 +79,13 @@ def confront(
             " grey"
         ) from error
     make_directory(output)
-    tracker = bench if fixed and has_screen else write_tracker(output, session, has_screen)
+    if fixed and has_screen:
+        tracker = bench
+    else:
+        tracker = write_tracker(output, session, has_screen)
     judge = Judge(session, tracker)
-    verdicts, pictures = [], []
+    verdicts = []
+    pictures = []
     try:
         for number in range(len(photos)):
             verdict = judge.of(number)

@@ -158,9 +158,13 @@ class Session:
         """What the sky's light of V = 0 has on the tracker, mag, as stars have theirs (see
         `LightFit.mag`).
         """
-        config, folder = self.file.config, self.file.folder
+        config = self.file.config
+        folder = self.file.folder
         optics = bench_optics(config.tracker, folder)
-        corrected_by = NO_CORRECTION if self.fixed else self.light.correction
+        if self.fixed:
+            corrected_by = NO_CORRECTION
+        else:
+            corrected_by = self.light.correction
         optics = replace(
             optics, quantum_efficiency=corrected(optics.quantum_efficiency, corrected_by)
         )
@@ -181,7 +185,8 @@ class Session:
         self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray
     ) -> FloatArray:
         """DN of stars (n,), rows of the sky of photograph `number`, at their places on it."""
-        sky, light = self.shots[number].sky, self.light
+        sky = self.shots[number].sky
+        light = self.light
         columns = sky.columns(sky.order[star])
         mag = _Magnitudes(self.file, columns)(NO_CORRECTION if self.fixed else light.correction)
         mag = mag + self.plane_mag(number, columns) + extinct_mag(self.air, sky, star)
@@ -198,8 +203,11 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     sky = dated_sky(file, photo.t_ns)
     points = ~sources.single & ~sources.trail
     field = _field(sources, points, photo)
-    found = _solve(field, base, sky, start) if len(field.places_px) >= MIN_MATCHED else None
-    if found is None and is_round(photo.dn):
+    if len(field.places_px) >= MIN_MATCHED:
+        solution = _solve(field, base, sky, start)
+    else:
+        solution = None
+    if solution is None and is_round(photo.dn):
         raise InputError(
             f"{photo.path}: its light fills a circle between dark corners: an all-sky lens, of"
             " which hilstar has no model; give frames of a lens under 120 degrees, whose sky fills"
@@ -210,10 +218,10 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
             f"{photo.path}: {len(field.places_px)} sources stand out of its noise, and an attitude"
             f" takes {MIN_MATCHED}; expose longer, open the cap, or look at a sky without cloud"
         )
-    if found is None:
+    if solution is None:
         raise InputError(f"{photo.path}: {_why_not(field, base, sky, sources, points, start)}")
-    kept = np.flatnonzero(points)
-    matched = replace(found, source=kept[found.source])
+    point_rows = np.flatnonzero(points)
+    matched = replace(solution, source=point_rows[solution.source])
     wide_px = float(np.median(sources.fwhm_px[np.sort(matched.source)[:BRIGHTEST]]))
     if wide_px > WIDE_PX:
         raise InputError(
@@ -225,8 +233,8 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
         level,
         sources,
         sky,
-        Pointing(found.q_icrs_to_cam, air=sky.air),
-        found.focal_length_px,
+        Pointing(solution.q_icrs_to_cam, air=sky.air),
+        solution.focal_length_px,
         matched,
         np.empty(0, dtype=np.intp),
     )
@@ -245,9 +253,9 @@ def _solve(
 ) -> SolvedField | None:
     if start is not None:
         near = rotate(conjugate(start), np.array([[0.0, 0.0, 1.0]]))[0]
-        found = solve_lost(field, base.focal_length_px, sky.vectors, near)
-        if found is not None:
-            return found
+        solution = solve_lost(field, base.focal_length_px, sky.vectors, near)
+        if solution is not None:
+            return solution
     return solve_lost(field, base.focal_length_px, sky.vectors)
 
 
@@ -261,15 +269,15 @@ def _why_not(
 ) -> str:
     """What is seen of a photograph without an attitude, and what to do."""
     bright = np.flatnonzero(points)[:BRIGHTEST]
-    length, width = np.median(sources.length_px[bright]), np.median(sources.width_px[bright])
+    length = np.median(sources.length_px[bright])
+    width = np.median(sources.width_px[bright])
     if sources.trail.sum() >= MIN_MATCHED or (
         length > TRAILED_PX and length > TRAILED_RATIO * width
     ):
-        trails = (
-            sources.length_px[sources.trail]
-            if sources.trail.sum() >= MIN_MATCHED
-            else np.array([length])
-        )
+        if sources.trail.sum() >= MIN_MATCHED:
+            trails = sources.length_px[sources.trail]
+        else:
+            trails = np.array([length])
         return (
             f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at"
             " rest, or a shorter exposure"
@@ -281,11 +289,11 @@ def _why_not(
         return (
             "is mirrored: its stars fit the sky only with left and right exchanged; flip the image"
         )
-    seen = f"has {len(field.places_px)} sources, and no part of the sky fits them"
+    reason = f"has {len(field.places_px)} sources, and no part of the sky fits them"
     degrees = math.degrees(2 * math.atan(field.width_px / 2 / base.focal_length_px))
     asked = " near --radec" if start is not None else ""
     return (
-        f"{seen}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and"
+        f"{reason}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and"
         " pixel_pitch_um" + ("" if start is not None else ", or give --radec RA,DEC,ROLL")
     )
 
@@ -305,12 +313,14 @@ def run_session(
     """
     shots = [open_shot(file, photo, base, start) for photo in photos]
     focal = float(np.median([shot.focal_length_px for shot in shots]))
-    base = replace(base, focal_length_px=focal) if fixed is None else fixed.camera
-    air = (
-        None
-        if shots[0].sky.air is None
-        else site_air(file.config, file.folder, shots[0].sky.catalog)
-    )
+    if fixed is None:
+        base = replace(base, focal_length_px=focal)
+    else:
+        base = fixed.camera
+    if shots[0].sky.air is None:
+        air = None
+    else:
+        air = site_air(file.config, file.folder, shots[0].sky.catalog)
     fit = partial(_fitted, file, base, fixed, air)
     session = fit(shots)
     off = abs(session.light.linearity - 1)
@@ -321,19 +331,21 @@ def run_session(
     ):
         return session
     # the root of the logarithm of a session's power over that of the power undone, by secants
-    before, undone = (0.0, math.log(session.light.linearity)), math.log(session.light.linearity)
+    before = (0.0, math.log(session.light.linearity))
+    undone = math.log(session.light.linearity)
     for _ in range(TONE_ROUNDS):
         power = math.exp(undone)
         linear = [
             _linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)
         ]
         trial = fit(linear, power=power, before=session.camera)
-        left = math.log(max(trial.light.linearity, 0.1))
-        if abs(left) < LINEAR_DONE:
+        log_linearity = math.log(max(trial.light.linearity, 0.1))
+        if abs(log_linearity) < LINEAR_DONE:
             return fit(trial.shots, power=power)
-        slope = (left - before[1]) / (undone - before[0])
-        step = -left / slope if slope < 0 else left
-        before, undone = (undone, left), undone + min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
+        slope = (log_linearity - before[1]) / (undone - before[0])
+        step = -log_linearity / slope if slope < 0 else log_linearity
+        before = (undone, log_linearity)
+        undone = undone + min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
     return session  # no power makes it linear: its figures say so
 
 
@@ -380,12 +392,18 @@ def _fitted(
     """The session of shots whose levels were made linear by a power; with the camera `before`,
     of their light alone.
     """
-    pointings = [shot.pointing for shot in shots] if before is None else list(before.pointings)
+    if before is None:
+        pointings = [shot.pointing for shot in shots]
+    else:
+        pointings = list(before.pointings)
     first = [_seen_at(s, s.matched.star, s.matched.source) for s in shots]
     if before is None and fixed is None:
         first, pointings = _outward(base, pointings, shots, first)
     camera = before or fit_camera(base, pointings, first, fixed=fixed is not None, last=False)
-    pixels = _pixels(shots, file.config.tracker.detector) if fixed is None else fixed.pixels
+    if fixed is None:
+        pixels = _pixels(shots, file.config.tracker.detector)
+    else:
+        pixels = fixed.pixels
     gain = pixels.gain_e_per_dn
     passes = PASSES if before is None else 1
     for number in range(passes):
@@ -407,8 +425,8 @@ def _fitted(
     magnitudes = _Magnitudes(file, np.concatenate(columns, axis=1))
     extinct = np.concatenate(
         [
-            extinct_mag(air, s.sky, s.star) + _channel_mag(file, s.photo.plane, own)
-            for s, own in zip(shots, columns, strict=True)
+            extinct_mag(air, s.sky, s.star) + _channel_mag(file, s.photo.plane, own_column)
+            for s, own_column in zip(shots, columns, strict=True)
         ]
     )
     light = fit_light(
@@ -428,7 +446,8 @@ def _fitted(
 
 def _seen_at(shot: Shot, star: IntArray, source: IntArray) -> Places:
     """Stars (n,) at their sources, before those are measured."""
-    x_px, y_px = shot.sources.x_px[source], shot.sources.y_px[source]
+    x_px = shot.sources.x_px[source]
+    y_px = shot.sources.y_px[source]
     return Places(x_px, y_px, np.full(len(star), FIRST_PX), shot.sky.vectors[star])
 
 
@@ -441,29 +460,31 @@ def _outward(
     Stars are matched a little further out by the k1 of those matched before, until no more are
     found.
     """
-    places, now = first, list(pointings)
+    places = first
+    now = list(pointings)
     for _ in range(MAX_ROUNDS):
         camera, turned = k1_camera(base, now, places)
-        found = [
-            _beyond(shot, camera, *one)
-            for shot, one in zip(shots, zip(turned, places, strict=True), strict=True)
+        matches = [
+            _beyond(shot, camera, *pose_and_places)
+            for shot, pose_and_places in zip(shots, zip(turned, places, strict=True), strict=True)
         ]
-        if max(_reach_px(camera, one) for one in found) < FURTHER * max(
-            _reach_px(camera, one) for one in places
+        if max(_reach_px(camera, pose_and_places) for pose_and_places in matches) < FURTHER * max(
+            _reach_px(camera, pose_and_places) for pose_and_places in places
         ):
             break
-        places, now = found, turned
-    return (first, list(pointings)) if places is first else (places, turned)
+        places = matches
+        now = turned
+    if places is first:
+        return (first, list(pointings))
+    return (places, turned)
 
 
 def _reach_px(camera: Camera, places: Places) -> float:
     """The radius about the principal point that holds 95 % of places."""
     cx, cy = camera.principal_point_px
-    return (
-        float(np.quantile(np.hypot(places.x_px - cx, places.y_px - cy), 0.95))
-        if len(places.x_px)
-        else 0.0
-    )
+    if len(places.x_px):
+        return float(np.quantile(np.hypot(places.x_px - cx, places.y_px - cy), 0.95))
+    return 0.0
 
 
 def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> Places:
@@ -483,10 +504,10 @@ def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> 
         )
     star = np.flatnonzero(inside)[: len(points)]
     tree = cKDTree(np.column_stack([sources.x_px[points], sources.y_px[points]]))
-    one, source = nearest_once(
+    star_index, source = nearest_once(
         tree, np.column_stack([x[star], y[star]]), NEAR * math.hypot(width, height)
     )
-    return _seen_at(shot, star[one], points[source])
+    return _seen_at(shot, star[star_index], points[source])
 
 
 def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:
@@ -497,8 +518,10 @@ def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray
     if not plane or len(channels) < 3:
         return np.zeros(columns.shape[1])
     both = channels["rgb".index(plane[0])], bench_optics(file.config.tracker, file.folder)
-    own, every = (magnitude(channel_rates(file.config.sky, optics)(*columns)) for optics in both)
-    return np.asarray(own - every)
+    own_mag, every = (
+        magnitude(channel_rates(file.config.sky, optics)(*columns)) for optics in both
+    )
+    return np.asarray(own_mag - every)
 
 
 def extinct_mag(air: SiteAir | None, sky: DatedSky, star: IntArray) -> FloatArray:
@@ -515,7 +538,9 @@ def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
     if sky.air is not None:
         return sky.masses(pointing.boresight)
     altitude = pointing.altitude_deg
-    return None if altitude is None else float(air_mass(np.radians([altitude]))[0])
+    if altitude is None:
+        return None
+    return float(air_mass(np.radians([altitude]))[0])
 
 
 def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
@@ -533,14 +558,18 @@ def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
     # stars too faint to be seen are pixels' own where two photographs have one part of the sky
     apart: list[int] = []
     for k, shot in enumerate(shots):
-        moved = [
-            np.linalg.norm(shot.pointing.boresight - shots[j].pointing.boresight)
-            * shot.focal_length_px
-            for j in apart
-        ]
+        moved = []
+        for j in apart:
+            moved.append(
+                np.linalg.norm(shot.pointing.boresight - shots[j].pointing.boresight)
+                * shot.focal_length_px
+            )
         if all(px > APART_PX for px in moved):
             apart.append(k)
-    zero = assumed.offset_dn if pedestal is None else pedestal[0]
+    if pedestal is None:
+        zero = assumed.offset_dn
+    else:
+        zero = pedestal[0]
     pattern = fixed_pattern(
         (s.photo.dn - s.level.level, s.level.level - zero, ~masks[k])
         for k, s in enumerate(shots)
@@ -564,15 +593,15 @@ def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
             (x > HALF) & (x < width - 1 - HALF) & (y > HALF) & (y < height - 1 - HALF)
         )
     tree = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
-    one, source = nearest_once(tree, np.column_stack([x[inside], y[inside]]), MATCH_PX)
-    star = inside[one]
+    star_index, source = nearest_once(tree, np.column_stack([x[inside], y[inside]]), MATCH_PX)
+    star = inside[star_index]
     every = cKDTree(np.column_stack([x[inside], y[inside]]))
     v = shot.sky.v_mag
     blended = np.zeros(len(star), dtype=bool)
-    for k, one in enumerate(star):
-        beside = inside[every.query_ball_point([x[one], y[one]], BLEND_PX)]
-        beside = beside[beside != one]
-        blended[k] = bool((v[beside] < v[one] + BLEND_MAG).any())
+    for k, star_index in enumerate(star):
+        beside = inside[every.query_ball_point([x[star_index], y[star_index]], BLEND_PX)]
+        beside = beside[beside != star_index]
+        blended[k] = bool((v[beside] < v[star_index] + BLEND_MAG).any())
     if len(shot.sources) > 1:
         snr = shot.sources.snr
         apart, other = (np.asarray(part)[:, -1] for part in tree.query(tree.data[source], k=2))
@@ -640,9 +669,12 @@ def _places(shot: Shot) -> Places:
         use = shot.clean
     if use.sum() < 3:
         use = np.ones(len(shot.star), dtype=bool)
-    found = shot.found
+    sources = shot.found
     return Places(
-        found.x_px[use], found.y_px[use], found.sigma_px[use], shot.sky.vectors[shot.star[use]]
+        sources.x_px[use],
+        sources.y_px[use],
+        sources.sigma_px[use],
+        shot.sky.vectors[shot.star[use]],
     )
 
 
@@ -655,14 +687,14 @@ def radius2_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray
 def _star_light(shots: Sequence[Shot], camera: Camera) -> StarLight:
     parts = []
     for k, shot in enumerate(shots):
-        found = shot.found
-        radius2 = radius2_of(camera, found.x_px, found.y_px)
+        sources = shot.found
+        radius2 = radius2_of(camera, sources.x_px, sources.y_px)
         sky = shot.sky
         parts.append(
             (
                 np.full(len(shot.star), k),
-                found.dn,
-                found.sigma_dn,
+                sources.dn,
+                sources.sigma_dn,
                 sky.v_mag[shot.star],
                 sky.bv_mag[shot.star],
                 radius2,
@@ -679,7 +711,8 @@ class _Magnitudes:
     """
 
     def __init__(self, file: BenchFile, columns: FloatArray) -> None:
-        self._file, self._columns = file, list(columns)
+        self._file = file
+        self._columns = list(columns)
         self._kept: dict[Correction, FloatArray] = {}
 
     def __call__(self, correction: Correction) -> FloatArray:

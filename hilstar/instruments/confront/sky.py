@@ -49,9 +49,9 @@ class DatedSky:
 
     def masses(self, direction: FloatArray) -> float | None:
         """Air masses before a direction outside the air (3,); None without a site or a date."""
-        return (
-            None if self.air is None else float(air_mass(self.air.altitude_rad(direction[None]))[0])
-        )
+        if self.air is None:
+            return None
+        return float(air_mass(self.air.altitude_rad(direction[None]))[0])
 
     @property
     def v_mag(self) -> FloatArray:
@@ -85,7 +85,9 @@ class DatedSky:
     def name(self, star: int) -> str:
         """What a star is called in the catalogue."""
         row = int(self.order[star])
-        return f"HIP {self.catalog.hip[row]}" if self.catalog.hip[row] else self.catalog.name(row)
+        if self.catalog.hip[row]:
+            return f"HIP {self.catalog.hip[row]}"
+        return self.catalog.name(row)
 
 
 def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
@@ -95,7 +97,10 @@ def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
     sky = file.config.sky
     catalog = choose_catalog(catalogue_choice(file.config, file.folder))
     epoch = sky.epoch_jyear if t_ns is None else jyear(t_ns)
-    velocity = None if t_ns is None else earth_velocity_km_s(t_ns)
+    if t_ns is None:
+        velocity = None
+    else:
+        velocity = earth_velocity_km_s(t_ns)
     air = None
     if file.config.site is not None and t_ns is not None:
         ground = Ground(file.config.site)
@@ -140,14 +145,14 @@ def planets_seen(t_ns: int) -> dict[str, FloatArray]:
     arcmin, the Moon 1 deg.
     """
     earth = np.array(_earth(t_ns)[0])
-    found = {}
+    planets = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         for number, name in enumerate(PLANETS, start=1):
             if name:
-                found[name] = erfa.plan94(UNIX_JD, t_ns / DAY_NS, number)["p"] - earth
-        found["the Moon"] = erfa.moon98(UNIX_JD, t_ns / DAY_NS)["p"]
+                planets[name] = erfa.plan94(UNIX_JD, t_ns / DAY_NS, number)["p"] - earth
+        planets["the Moon"] = erfa.moon98(UNIX_JD, t_ns / DAY_NS)["p"]
     return {
         name: np.asarray(aberrate((v / np.linalg.norm(v))[None], earth_velocity_km_s(t_ns))[0])
-        for name, v in found.items()
+        for name, v in planets.items()
     }

@@ -57,24 +57,22 @@ class StarPsf:
     def core(self, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray) -> FloatArray:
         """Covariances (n, 3) at places."""
         terms = field_terms(x_px, y_px, self.size_px)[:, : self.covariance.shape[1]]
-        found = terms @ self.covariance.T
-        found *= np.clip(
+        core_light = terms @ self.covariance.T
+        core_light *= np.clip(
             1 + self.colour * (np.nan_to_num(bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG), 0.3, 3.0
         )[:, None]
-        found[:, :2] = np.clip(found[:, :2], MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
-        limit = 0.9 * np.sqrt(found[:, 0] * found[:, 1])
-        found[:, 2] = np.clip(found[:, 2], -limit, limit)
-        return found
+        core_light[:, :2] = np.clip(core_light[:, :2], MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
+        limit = 0.9 * np.sqrt(core_light[:, 0] * core_light[:, 1])
+        core_light[:, 2] = np.clip(core_light[:, 2], -limit, limit)
+        return core_light
 
     def fwhm_px(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Full width at half maximum of what pixels get, (n,): of core, wings and a pixel, all
         made round.
         """
         core = self.core(x_px, y_px, np.full(len(x_px), MEAN_BV_MAG))
-        narrow, wide = (
-            (core[:, 0] + core[:, 1]) / 2 + 1 / 12,
-            np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12),
-        )
+        narrow = (core[:, 0] + core[:, 1]) / 2 + 1 / 12
+        wide = np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12)
         radius = np.linspace(0, 12, 1201)
         parts = ((1 - self.wing_share, narrow), (self.wing_share, wide))
         light = np.sum(
@@ -133,9 +131,10 @@ class StarPsf:
 def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) -> FloatArray:
     """Terms (n, 6) of the field."""
     half = math.hypot(*size_px) / 2
-    u, v = (x_px - (size_px[0] - 1) / 2) / half, (y_px - (size_px[1] - 1) / 2) / half
-    one, u, v, uu, uv, vv = place_terms(u, v).T
-    return np.column_stack([one, uu + vv, u, v, uu - vv, uv])
+    u = (x_px - (size_px[0] - 1) / 2) / half
+    v = (y_px - (size_px[1] - 1) / 2) / half
+    ones, u, v, uu, uv, vv = place_terms(u, v).T
+    return np.column_stack([ones, uu + vv, u, v, uu - vv, uv])
 
 
 def _gaussians(dx: FloatArray, dy: FloatArray, covariance: FloatArray) -> PixelGaussians:
@@ -175,7 +174,7 @@ def join(parts: Sequence[Stamps]) -> Stamps:
     """All stamps of several photographs."""
     return Stamps(
         *(
-            np.concatenate([getattr(one, name) for one in parts])
+            np.concatenate([getattr(part, name) for part in parts])
             for name in ("values", "variance", "column", "row", "bv_mag")
         )
     )
@@ -203,8 +202,10 @@ def cut_stamps(
     """
     height, width = above.shape
     reach = np.arange(-HALF, HALF + 1)
-    column, row = np.rint(x_px), np.rint(y_px)
-    columns, rows = column[:, None] + reach, row[:, None] + reach
+    column = np.rint(x_px)
+    row = np.rint(y_px)
+    columns = column[:, None] + reach
+    rows = row[:, None] + reach
     inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[
         :, None, :
     ]
@@ -227,26 +228,25 @@ def measure(
     """Stars by least squares of place, flux and a level, from starting places; photon noise by
     `gain_e_per_dn`.
     """
-    x, y = x_px.copy(), y_px.copy()
+    x = x_px.copy()
+    y = y_px.copy()
     reach = np.arange(-HALF, HALF + 1)
     core = psf.core(x, y, stamps.bv_mag)
     weight = 1 / stamps.variance
-    flux, level = np.zeros(len(x)), np.zeros(len(x))
+    flux = np.zeros(len(x))
+    level = np.zeros(len(x))
     for number in range(PLACE_STEPS):
-        dx, dy = (
-            stamps.column[:, None] + reach - x[:, None],
-            stamps.row[:, None] + reach - y[:, None],
-        )
+        dx = stamps.column[:, None] + reach - x[:, None]
+        dy = stamps.row[:, None] + reach - y[:, None]
         shape, by_x, by_y = psf.on_pixels(dx, dy, core)
         # photon noise of the model, not of what was seen: else faint stars come out too faint
         if number:
             star = np.maximum(flux, 0)[:, None, None] * shape
             weight = 1 / (stamps.variance + star / gain_e_per_dn + (MODEL_ERROR * star) ** 2)
-        flux = (
-            np.maximum(flux, 1e-3)
-            if number
-            else _linear(shape, stamps.values, weight)[0].clip(min=1e-3)
-        )
+        if number:
+            flux = np.maximum(flux, 1e-3)
+        else:
+            flux = _linear(shape, stamps.values, weight)[0].clip(min=1e-3)
         columns = np.stack(
             [flux[:, None, None] * by_x, flux[:, None, None] * by_y, shape, np.ones_like(shape)],
             axis=1,
@@ -261,7 +261,8 @@ def measure(
         move = np.linalg.solve(normal, right[..., None])[..., 0]
         x += np.clip(move[:, 0], -0.5, 0.5)
         y += np.clip(move[:, 1], -0.5, 0.5)
-        flux, level = flux + move[:, 2], level + move[:, 3]
+        flux = flux + move[:, 2]
+        level = level + move[:, 3]
         if np.quantile(np.abs(move[:, :2]), 0.98) < PLACE_DONE_PX:
             break
     covariance = np.linalg.inv(normal)
@@ -276,8 +277,11 @@ def _linear(
 ) -> tuple[FloatArray, FloatArray]:
     """Flux and level (n,) by least squares."""
     s, v, w = (part.reshape(len(shape), -1) for part in (shape, values, weight))
-    sw, s1, ss = w.sum(axis=1), (w * s).sum(axis=1), (w * s * s).sum(axis=1)
-    v1, vs = (w * v).sum(axis=1), (w * v * s).sum(axis=1)
+    sw = w.sum(axis=1)
+    s1 = (w * s).sum(axis=1)
+    ss = (w * s * s).sum(axis=1)
+    v1 = (w * v).sum(axis=1)
+    vs = (w * v * s).sum(axis=1)
     det = np.maximum(ss * sw - s1 * s1, 1e-300)
     return (vs * sw - v1 * s1) / det, (ss * v1 - s1 * vs) / det
 
@@ -294,16 +298,17 @@ def fit_psf(
     start = np.zeros((3, terms))
     start[:, 0] = _first_covariance(stamps, x_px, y_px)
     psf = StarPsf(start, 0.0, 0.05, 2.0, size_px)
-    x, y = x_px, y_px
-    found = measure(stamps, psf, x, y, gain_e_per_dn)
+    x = x_px
+    y = y_px
+    measured = measure(stamps, psf, x, y, gain_e_per_dn)
     for number in range(SHAPE_ROUNDS):
-        psf = _shape(stamps, found, psf, gain_e_per_dn, wide=number > 0)
-        near = np.hypot(found.x_px - x_px, found.y_px - y_px) < 2
-        found = measure(
+        psf = _shape(stamps, measured, psf, gain_e_per_dn, wide=number > 0)
+        near = np.hypot(measured.x_px - x_px, measured.y_px - y_px) < 2
+        measured = measure(
             stamps,
             psf,
-            np.where(near, found.x_px, x_px),
-            np.where(near, found.y_px, y_px),
+            np.where(near, measured.x_px, x_px),
+            np.where(near, measured.y_px, y_px),
             gain_e_per_dn,
         )
     return psf
@@ -346,20 +351,22 @@ def _shape(
     root = np.sqrt(weight)
     redder = np.nan_to_num(stamps.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
     ratio = np.clip(psf.wing_share, 0.01, 0.49) / 0.5
-    tail = [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)] if wide else []
+    if wide:
+        tail = [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)]
+    else:
+        tail = []
     start = np.concatenate([psf.covariance.ravel(), tail])
     # weak: terms of the field are 0 +- 1 px^2, and the wings stay within factors of those before
-    prior, about = np.eye(len(start)), np.where(np.arange(len(start)) < 3 * count, 0.0, start)
+    prior = np.eye(len(start))
+    about = np.where(np.arange(len(start)) < 3 * count, 0.0, start)
     prior = prior[[*(np.arange(3 * count) % count > 0), *(False, True, True)[: len(tail)]]]
 
     def of(numbers: FloatArray) -> StarPsf:
         covariance = numbers[: 3 * count].reshape(3, count)
         if not wide:
             return replace(psf, covariance=covariance)
-        share, sigma = (
-            0.5 * float(expit(numbers[-2])),
-            math.exp(np.clip(numbers[-1], *np.log(WING_SIGMA_PX))),
-        )
+        share = 0.5 * float(expit(numbers[-2]))
+        sigma = math.exp(np.clip(numbers[-1], *np.log(WING_SIGMA_PX)))
         return replace(
             psf,
             covariance=covariance,
@@ -391,12 +398,12 @@ def _shape(
                 by[4] * trial.wing_sigma_px,
             ]
         flux = _linear(shape, stamps.values, weight)[0][:, None, None]
-        left = []
+        differences = []
         for column in columns:
             of_shape, of_level = _linear(shape, flux * column, weight)
             change = flux * column - of_shape[:, None, None] * shape - of_level[:, None, None]
-            left.append(np.concatenate([-(change * root).ravel(), np.zeros(len(prior))]))
-        found = np.stack(left, axis=1)
+            differences.append(np.concatenate([-(change * root).ravel(), np.zeros(len(prior))]))
+        found = np.stack(differences, axis=1)
         found[len(off) - len(prior) :] = prior
         return found
 

@@ -27,7 +27,7 @@ MODE_FLAGS = {
 
 def json_answer(answer: Answer) -> bytes:
     """An answer as a JSON object in one line, without its end."""
-    said: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "t_ns": answer.t_ns,
         "valid": answer.valid,
         "mode": answer.mode,
@@ -35,22 +35,23 @@ def json_answer(answer: Answer) -> bytes:
     }
     for name, vector in (("q", answer.q_icrs_to_cam), ("rate", answer.rate_cam_rad_s)):
         if vector is not None:
-            said[name] = vector.tolist()
+            fields[name] = vector.tolist()
     if answer.rms_arcsec is not None:
-        said["rms_arcsec"] = answer.rms_arcsec
-    said["centroids"] = [
+        fields["rms_arcsec"] = answer.rms_arcsec
+    fields["centroids"] = [
         [part if part is None else round(part, STAR_DECIMALS) for part in star]
         for star in answer.centroids
     ]
-    for star in said["centroids"]:
+    for star in fields["centroids"]:
         if star[-1] is None:
             star.pop()
-    return msgspec.json.encode(said)
+    return msgspec.json.encode(fields)
 
 
 def answer_packet(answer: Answer, sequence: int) -> AnswerPacket:
     """An answer as a packet of the wire."""
-    q, rate = answer.q_icrs_to_cam, answer.rate_cam_rad_s
+    q = answer.q_icrs_to_cam
+    rate = answer.rate_cam_rad_s
     known = protocol.ANSWER_VALID * (q is not None) + protocol.ANSWER_RATE_VALID * (
         rate is not None
     )
@@ -76,7 +77,9 @@ class AnswerLink(Closing):
     def __init__(
         self, target: str, form: str, connect: bool, babble: np.random.Generator | None
     ) -> None:
-        self._end, self._form, self._babble = open_sender(target, connect=connect), form, babble
+        self._end = open_sender(target, connect=connect)
+        self._form = form
+        self._babble = babble
         self.endpoint = self._end.endpoint
         self.sent = self.babbled = 0
 

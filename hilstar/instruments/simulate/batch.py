@@ -45,7 +45,8 @@ def log_views(
     ends the rate is that of the part inside.
     """
     timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
-    first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
+    first_ns = samples[0].t_ns
+    last_ns = samples[-1].t_ns
     if frame_count is None:
         times_ns = [sample.t_ns for sample in samples]
     else:
@@ -89,10 +90,10 @@ class LogFaults:
         zero_ns = self.samples[0].t_ns
 
         def attitude_at(run_ns: int) -> FloatArray:
-            found = timeline.at(zero_ns + run_ns)
-            if found is None:
+            state = timeline.at(zero_ns + run_ns)
+            if state is None:
                 raise AssertionError("a log has a sample")
-            return found.q_icrs_to_cam
+            return state.q_icrs_to_cam
 
         return [
             pieces_of(view, (view.t_ns or 0) - zero_ns, timetable, attitude_at) for view in views
@@ -133,12 +134,12 @@ def simulate_views(
             pool.start()
         done = 0
         while done < len(views):
-            for worker, news, said in pool.heard():
+            for worker, news, payload in pool.heard():
                 if news == "error":
-                    raise said
+                    raise payload
                 if news == "died":
                     raise MachineError(
-                        f"a process of the pool ended with code {said}; is there enough memory?"
+                        f"a process of the pool ended with code {payload}; is there enough memory?"
                     )
                 if news == "answer":
                     done += 1
@@ -154,12 +155,18 @@ def _start_exposing(
 ) -> tuple[None, Callable[[int, View, tuple[ExposurePiece, ...]], None]]:
     """In a worker: no greeting, and the work, which writes one exposure."""
     simulator = Simulator(file)
-    seen_by = None if scenario is None else simulator_view(simulator, scenario)
+    if scenario is None:
+        seen_by = None
+    else:
+        seen_by = simulator_view(simulator, scenario)
     if seen_by is not None and scenario is not None:
         scenario.prepared(seen_by.prepare)
 
     def expose(number: int, view: View, pieces: tuple[ExposurePiece, ...]) -> None:
-        faults = None if seen_by is None else FaultyExposure(seen_by, pieces)
+        if seen_by is None:
+            faults = None
+        else:
+            faults = FaultyExposure(seen_by, pieces)
         exposure = simulator.expose(view, noise.rng(number), faults=faults)
         write_exposure_fits(directory / f"exposure_{number:06d}.fits", simulator, exposure, noise)
 

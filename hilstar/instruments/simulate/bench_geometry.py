@@ -55,7 +55,8 @@ class BenchGeometry:
     def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where the mirror shows pixels (n,) of the image, and which pixels it shows there."""
         width, height = self.monitor.resolution_px
-        middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
+        middle_x = (width - 1) / 2
+        middle_y = (height - 1) / 2
         match self.mirror:
             case "x":
                 return 2 * middle_x - x_px, y_px

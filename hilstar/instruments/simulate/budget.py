@@ -109,7 +109,8 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     """
     by = centroider or bench.config.verify.judge or USUAL
     found = _errors(bench)
-    render, white = bench.config.render, bench.flux_at_white_e_per_s
+    render = bench.config.render
+    white = bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
     white /= solar_drive(bench)
@@ -126,10 +127,14 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     corner_share = float(bench.psf.shares(half, half[:, None]).max())
     channels = named_channels(bench.config.tracker, bench.file.folder)
     spectra = bench_primaries(bench.config.monitor, bench.file.folder)
-    primaries = (
-        None if spectra is None else channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
-    )
-    ends_nm = [RED_NM] if spectra is None else [RED_NM, reddest_nm(spectra)]
+    if spectra is None:
+        primaries = None
+    else:
+        primaries = channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
+    if spectra is None:
+        ends_nm = [RED_NM]
+    else:
+        ends_nm = [RED_NM, reddest_nm(spectra)]
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation
@@ -166,7 +171,8 @@ def out_of_gamut(bench: Bench) -> float | None:
     """The share of a bench's stars whose colour its primaries cannot show; None where they are
     not driven apart.
     """
-    colours, count = bench.colours, len(bench.stars.rates_e_per_s)
+    colours = bench.colours
+    count = len(bench.stars.rates_e_per_s)
     if colours is None:
         return None
     alone = np.arange(count)
@@ -183,9 +189,9 @@ def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[s
         **(channels if len(channels) > 1 else {}),
     }
     return [
-        {"channel": name, "from_nm": nm, "by_class": class_shares(one, nm)}
+        {"channel": name, "from_nm": nm, "by_class": class_shares(channel_shares, nm)}
         for nm in ends_nm
-        for name, one in every.items()
+        for name, channel_shares in every.items()
     ]
 
 
@@ -195,7 +201,8 @@ def zero_point_mag(bench: Bench) -> float:
 
     Raises InputError where it has none.
     """
-    rates_e_per_s, alike = bench.stars.rates_e_per_s, _like_the_sun(bench)
+    rates_e_per_s = bench.stars.rates_e_per_s
+    alike = _like_the_sun(bench)
     return float(np.median(bench.stars.v_mag[alike] - magnitude(rates_e_per_s[alike])))
 
 
@@ -227,23 +234,26 @@ def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     """The errors at each magnitude below full scale, down to the first at which a star shows
     nothing.
     """
-    target, frames = bench.renderer.target, bench.config.exposure_frames
+    target = bench.renderer.target
+    frames = bench.config.exposure_frames
     psf = bench.psf
     sprites, _ = phase_grid(PHASES, psf)
     bright = phase_image(sprites, psf)
     judge = Judge(
         bright, line_places(sprites), psf.width_px, target.seen.blur_px, target.seen.pixel_px
     )
-    panel, balance = Panel(bench.calibration.response, WHITE), Balance(psf, target.seen)
-    found = []
+    panel = Panel(bench.calibration.response, WHITE)
+    balance = Balance(psf, target.seen)
+    error_rows = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
-        wanted, stars = (bright * flux_ratio(mag)).astype(np.float32), fainter(sprites, mag)
+        wanted = (bright * flux_ratio(mag)).astype(np.float32)
+        stars = fainter(sprites, mag)
         kind = QUANTISERS[target.quantisation]
         shown = shown_by(kind, frames, panel, wanted, stars, balance)
-        found.append((mag, judge.errors(shown, flux_ratio(mag))))
-        if not np.isfinite(found[-1][1].flux_mag).all():
+        error_rows.append((mag, judge.errors(shown, flux_ratio(mag))))
+        if not np.isfinite(error_rows[-1][1].flux_mag).all():
             break
-    return found
+    return error_rows
 
 
 def _finite(value: float) -> float | None:
@@ -275,7 +285,8 @@ def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:
             good += 1
         return rows[good - 1].below_white_mag if good else None
 
-    flux, centroid = [row.flux_max_mag for row in rows], [row.centroid_max_px for row in rows]
+    flux = [row.flux_max_mag for row in rows]
+    centroid = [row.centroid_max_px for row in rows]
     limits = {f"{limit:g}_mag": reach(flux, limit) for limit in FLUX_LIMITS_MAG}
     return limits | {f"{CENTROID_LIMIT_PX:g}_px": reach(centroid, CENTROID_LIMIT_PX)}
 
@@ -318,7 +329,8 @@ def write_report(directory: Path, found: LightBudget) -> None:
             unit = "mag" if kind == "flux" else "px"
             for name, word, colour in (("max", "largest to V", ORANGE), ("rms", "rms", BLUE)):
                 values = np.array([getattr(row, f"{kind}_{name}_{unit}") for row in shown])
-                values = np.maximum.accumulate(values.astype(float)) if name == "max" else values
+                if name == "max":
+                    values = np.maximum.accumulate(values.astype(float))
                 axis.semilogy(v_mag, np.maximum(values, MIN_ERROR), color=colour, label=word)
             for limit in limits:
                 axis.axhline(
@@ -348,7 +360,7 @@ def budget_lines(found: LightBudget) -> list[str]:
         f"{_number(value, 'g')} mag within {limit.replace('_', ' ')}"
         for limit, value in found.within.items()
     )
-    each = ", ".join(
+    centroid_text = ", ".join(
         f"{kind} {_number(value, '.4f')}" for kind, value in found.centroid_rms_px.items()
     )
     lines = [
@@ -363,7 +375,7 @@ def budget_lines(found: LightBudget) -> list[str]:
         ),
         f"{'below full scale':22}{within}",
         f"{'centroider':22}{found.centroider}, in the tracker's pixels after its blur",
-        f"{f'{COMPARED_MAG:g} mag below it':22}{each} px rms along an axis",
+        f"{f'{COMPARED_MAG:g} mag below it':22}{centroid_text} px rms along an axis",
         f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
         (
             f"{'not drawn':22}{found.left_out.stars} stars, too faint:"
@@ -373,20 +385,23 @@ def budget_lines(found: LightBudget) -> list[str]:
         f"{'in the tracker':22}{found.star.line()}",
     ]
     if found.primaries is not None:
-        one = found.primaries
-        figure = _number(one.condition, ".2f")
+        primaries = found.primaries
+        figure = _number(primaries.condition, ".2f")
         lines.append(
             f"{'condition number':22}{figure}, electrons of each channel by each primary at full"
             " light:"
         )
         if found.out_of_gamut is not None:
-            what = "electrons by channel" if len(one.channels) > 1 else "mean wavelength"
+            if len(primaries.channels) > 1:
+                what = "electrons by channel"
+            else:
+                what = "mean wavelength"
             lines.insert(
                 -1,
                 f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries"
                 " cannot show",
             )
-        for channel, rates in zip(one.channels, one.e_per_s.tolist(), strict=True):
+        for channel, rates in zip(primaries.channels, primaries.e_per_s.tolist(), strict=True):
             shares = (
                 f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True)
             )
@@ -398,9 +413,10 @@ def budget_lines(found: LightBudget) -> list[str]:
             f"{name:22}{by_class}" + ("" if red["channel"] == "all" else f"  {red['channel']}")
         )
     every = found.centroider == "all"
-    kinds = (
-        f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
-    )
+    if every:
+        kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}"
+    else:
+        kinds = f"{'centroid rms':>14}"
     lines += [
         "",
         f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}"

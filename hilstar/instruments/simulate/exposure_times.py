@@ -62,7 +62,9 @@ class CameraExposures:
     """
 
     def __init__(self, clock: OwnTime, begun_ns: int, camera: GigECamera, always: bool) -> None:
-        self._clock, self._camera, self._always = clock, camera, always
+        self._clock = clock
+        self._camera = camera
+        self._always = always
         self._rate_hz = 0.0
         self._free = FreeExposures(clock, begun_ns, NS_PER_S)
         self._trigger_ns: int | None = None
@@ -92,7 +94,8 @@ class CameraExposures:
     def done(self) -> None:
         """Go on to the next one."""
         if self._trigger_ns is not None:
-            self._newest_ns, self._trigger_ns = self._trigger_ns, None
+            self._newest_ns = self._trigger_ns
+            self._trigger_ns = None
             return
         self._newest_ns = self._free.next_ns()
         self._free.done()

@@ -107,8 +107,10 @@ def sky_under(dn: DigitalNumbers) -> Sky:
 def _blocks(dn: DigitalNumbers) -> _Blocks:
     height, width = dn.shape
     side = int(np.clip(min(height, width) // BLOCKS_A_SIDE, MIN_BLOCK_PX, MAX_BLOCK_PX))
-    rows, columns = max(height // side, 1), max(width // side, 1)
-    high, wide = height // rows, width // columns
+    rows = max(height // side, 1)
+    columns = max(width // side, 1)
+    high = height // rows
+    wide = width // columns
     whole = dn[: rows * high, : columns * wide].astype(np.float64)
     pixels = whole.reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows * columns, -1)
     level = np.median(pixels, axis=1)

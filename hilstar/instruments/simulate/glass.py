@@ -34,21 +34,22 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
             )
         places = columns + x, rows + y
         light = psf.stamps_at(*places, psf.mean_shares if shares is None else shares)
-        own = light.shape[1]
+        own_size = light.shape[1]
         light = np.pad(light, ((0, 0), (1, 1), (1, 1)))
         # The glass's square is about the pixel nearest to the star, this one about its own.
-        to = [
-            np.clip(
-                middle[:, None]
-                + near
-                - np.floor(place + 0.5).astype(np.intp)[:, None]
-                + own // 2
-                + 1,
-                0,
-                own + 1,
+        to = []
+        for place, middle in zip(places, (columns, rows), strict=True):
+            to.append(
+                np.clip(
+                    middle[:, None]
+                    + near
+                    - np.floor(place + 0.5).astype(np.intp)[:, None]
+                    + own_size // 2
+                    + 1,
+                    0,
+                    own_size + 1,
+                )
             )
-            for place, middle in zip(places, (columns, rows), strict=True)
-        ]
         return np.asarray(
             light[np.arange(len(x))[:, None, None], to[1][:, :, None], to[0][:, None, :]],
             dtype=np.float64,
@@ -102,6 +103,6 @@ def split_errors(
     )
     by_place = np.stack([u**j * v**k for j in range(4) for k in range(4 - j)], axis=1)
     by_colour = (bv_mag - bv_mag.mean())[:, None] * np.stack([np.ones_like(u), u, v], axis=1)
-    found = np.linalg.lstsq(np.hstack([by_place, by_colour]), errors_px, rcond=None)[0]
+    solution = np.linalg.lstsq(np.hstack([by_place, by_colour]), errors_px, rcond=None)[0]
     count = by_place.shape[1]
-    return ErrorSplit(errors_px, by_place @ found[:count], by_colour @ found[count:])
+    return ErrorSplit(errors_px, by_place @ solution[:count], by_colour @ solution[count:])

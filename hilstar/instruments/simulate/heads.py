@@ -70,20 +70,23 @@ class _Head:
         """The body's attitude as this head's stars have it, from linear light and from codes;
         None with too few stars.
         """
-        seen = self.twin.field(multiply(self.mounting.q_body_to_cam, q_icrs_to_body), first_frame)
-        sky, shown = (
-            self.finder.match(image_e, seen.x_px, seen.y_px)
-            for image_e in (seen.sky_e, seen.shown_e)
+        head_field = self.twin.field(
+            multiply(self.mounting.q_body_to_cam, q_icrs_to_body), first_frame
         )
-        stars = np.flatnonzero(self._usable(seen, sky, shown))
+        sky, shown = (
+            self.finder.match(image_e, head_field.x_px, head_field.y_px)
+            for image_e in (head_field.sky_e, head_field.shown_e)
+        )
+        stars = np.flatnonzero(self._usable(head_field, sky, shown))
         if len(stars) < MIN_STARS:
             return None
-        wanted = self._directions(seen.x_px[stars], seen.y_px[stars])
+        wanted = self._directions(head_field.x_px[stars], head_field.y_px[stars])
         # Linear light places all stars alike; codes place bright stars better.
-        alike, light = np.ones(len(stars)), seen.truth["electrons_per_s"][stars].astype(np.float64)
+        alike = np.ones(len(stars))
+        light = head_field.truth["electrons_per_s"][stars].astype(np.float64)
         linear, codes = (
-            self._body(q_icrs_to_body, self._found(one, stars), wanted, weights)
-            for one, weights in ((sky, alike), (shown, light))
+            self._body(q_icrs_to_body, self._found(vectors, stars), wanted, weights)
+            for vectors, weights in ((sky, alike), (shown, light))
         )
         return linear, codes
 
@@ -100,13 +103,14 @@ class _Head:
         bench = self.twin.bench
         reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
         screen_w, screen_h = bench.camera.resolution_px
-        x, y = truth["x_px"], truth["y_px"]
+        x = truth["x_px"]
+        y = truth["y_px"]
         inside &= (
             (x > reach) & (x < screen_w - 1 - reach) & (y > reach) & (y < screen_h - 1 - reach)
         )
         near = crowded(seen.x_px, seen.y_px, truth["electrons_per_s"], radius_px, self.finder.psf)
-        found = (sky.index >= 0) & (shown.index >= 0) & ~shared(sky.index)
-        return np.asarray(inside & found & truth["drawn"] & ~truth["clipped"] & ~near)
+        is_matched = (sky.index >= 0) & (shown.index >= 0) & ~shared(sky.index)
+        return np.asarray(inside & is_matched & truth["drawn"] & ~truth["clipped"] & ~near)
 
     def _directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         rays = self.twin.camera.rays(x_px, y_px)
@@ -151,7 +155,8 @@ def verify_heads(
         seen_by = [_Head(stack.enter_context(Twin(file))) for file in heads.files]
         for number in range(fields):
             q = rng.normal(size=4)
-            q_icrs_to_body, first_frame = q / np.linalg.norm(q), int(rng.integers(0, MASK_TURNS))
+            q_icrs_to_body = q / np.linalg.norm(q)
+            first_frame = int(rng.integers(0, MASK_TURNS))
             solved = [head.solved(q_icrs_to_body, first_frame) for head in seen_by]
             for pair, (one, other) in zip(pairs, combinations(solved, 2), strict=True):
                 if one is not None and other is not None:

@@ -107,7 +107,9 @@ class WatchedFrames:
     @property
     def newest_ns(self) -> int:
         """When the newest frame was lit; 0 before any."""
-        return self._frames[-1].head.lit_ns if self._frames else 0
+        if self._frames:
+            return self._frames[-1].head.lit_ns
+        return 0
 
     def exposed(self, begin_ns: int, end_ns: int) -> Exposed | None:
         """The mean of what was lit in a span; None where its beginning is not known."""
@@ -129,7 +131,7 @@ class WatchedFrames:
         lit, first = np.unique(np.concatenate(places), return_inverse=True)
         columns = np.concatenate(lights).T
         light = np.array(
-            [np.bincount(first, one, minlength=len(lit)) for one in columns], dtype=np.float64
+            [np.bincount(first, column, minlength=len(lit)) for column in columns], dtype=np.float64
         ).T
         shown = sum((share for _, share in turns), 0.0)
         return Exposed(
@@ -141,7 +143,8 @@ def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
     """The mean rotation of attitudes with weights: of small turns from the first."""
     if not turns:
         return None
-    first, total = turns[0][0], sum(share for _, share in turns)
+    first = turns[0][0]
+    total = sum(share for _, share in turns)
     about = np.sum(
         [share / total * to_rotation_vector(multiply(q, conjugate(first))) for q, share in turns],
         axis=0,
@@ -176,7 +179,9 @@ class LiveTracker(Closing):
     lost_in_space: Solve | None = None
 
     def __init__(self, file: BenchFile, rng: np.random.Generator) -> None:
-        self.file, self.config, self._rng = file, file.config, rng
+        self.file = file
+        self.config = file.config
+        self._rng = rng
         tracker = self.config.tracker
         self.exposure_s = tracker.exposure_s
         self.camera = tracker_camera(tracker, file.folder)
@@ -186,7 +191,8 @@ class LiveTracker(Closing):
             self._bench = bench  # its light; its renderer is closed
             self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
             self._panel = true_panel(bench)
-            self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)
+            self._rgb = bench.calibration.response.rgb
+            self._primaries = seen_primaries(bench)
             self._colours = DisplayColours.of(bench)
             self._optics = TwinOptics(true_geometry(bench, self.camera), bench.tracker_psf)
             glow_e_per_s = self._optics.glow_e_per_s(self._panel)
@@ -239,7 +245,8 @@ class LiveTracker(Closing):
         )
         if kind != mine:
             shown, wanted = (
-                "{} x {} pixels of {} bits in {} channels".format(*each) for each in (kind, mine)
+                "{} x {} pixels of {} bits in {} channels".format(*frame_kind)
+                for frame_kind in (kind, mine)
             )
             raise InputError(
                 f"frames of {shown}, the bench file has {wanted}; give the bench file of serve"
@@ -251,7 +258,8 @@ class LiveTracker(Closing):
         if (exposure_s, gain_db) == (self.exposure_s, self._gain_db):
             return
         self._under_e = self._bench_under_e * (exposure_s / self._bench_exposure_s)
-        self.exposure_s, self._gain_db = exposure_s, gain_db
+        self.exposure_s = exposure_s
+        self._gain_db = gain_db
         tracker = self.config.tracker
         gain_e_per_dn = tracker.detector.gain_e_per_dn / 10 ** (gain_db / 20)
         settings = msgspec.structs.replace(tracker.detector, gain_e_per_dn=gain_e_per_dn)
@@ -269,26 +277,31 @@ class LiveTracker(Closing):
     def solve(self, exposed: Exposed, dn: npt.NDArray[np.uint16]) -> Solved:
         """The attitude of an exposure, whose image is `dn`."""
         expected = self._expected(exposed)
-        found = self._found(dn, exposed, expected)
+        stars = self._found(dn, exposed, expected)
         settings = self.config.tracker.detector
         if np.count_nonzero(dn == 2**settings.bits - 1) > BLINDED_SHARE * dn.size:
-            return self._answered(Solved(exposed, BLINDED, found))
-        identified = (
-            None if expected is None else identify(found, expected, self._near, self._place)
-        )
+            return self._answered(Solved(exposed, BLINDED, stars))
+        if expected is None:
+            identified = None
+        else:
+            identified = identify(stars, expected, self._near, self._place)
         mode = TRACKING
-        if identified is None and self.lost_in_space is not None and len(found):
+        if identified is None and self.lost_in_space is not None and len(stars):
             mode = LOST
-            guess = self.lost_in_space(found, dn)
-            identified = None if guess is None else identify(found, guess, self._near, self._place)
+            guess = self.lost_in_space(stars, dn)
+            if guess is None:
+                identified = None
+            else:
+                identified = identify(stars, guess, self._near, self._place)
         if identified is None:
-            mode = TOO_FEW if len(found) < MIN_STARS else LOST
-        return self._answered(Solved(exposed, mode, found, identified))
+            mode = TOO_FEW if len(stars) < MIN_STARS else LOST
+        return self._answered(Solved(exposed, mode, stars, identified))
 
     def _answered(self, solved: Solved) -> Solved:
         if solved.identified is not None:
             at_ns = solved.exposed.middle_ns
-            self._before, self._last = self._last, (at_ns, solved.identified.q_icrs_to_cam)
+            self._before = self._last
+            self._last = (at_ns, solved.identified.q_icrs_to_cam)
         return solved
 
     def _expected(self, exposed: Exposed) -> FloatArray | None:
@@ -305,7 +318,8 @@ class LiveTracker(Closing):
         """The turn between the last two attitudes (3,), cam; 0 where there are none of the last
         second.
         """
-        before, last = self._before, self._last
+        before = self._before
+        last = self._last
         if before is None or last is None or last[0] - before[0] > TURN_S * NS_PER_S:
             return np.zeros(3)
         return rate_between_rad_s(before[1], last[1], (last[0] - before[0]) / NS_PER_S)
@@ -333,32 +347,30 @@ class LiveTracker(Closing):
         settings = CentroidSettings(
             window_sigma_px=window_px, psf_sigma_px=psf_px if still else None
         )
-        seen = find_stars(image, settings, background)
-        good = ~seen.at_edge
-        x_px, y_px = seen.x_px[good], seen.y_px[good]
-        flux_e = seen.flux[good] * self._detector.settings.gain_e_per_dn
+        stars = find_stars(image, settings, background)
+        good = ~stars.at_edge
+        x_px = stars.x_px[good]
+        y_px = stars.y_px[good]
+        flux_e = stars.flux[good] * self._detector.settings.gain_e_per_dn
         return FoundStars(x_px, y_px, flux_e, normalise(self.camera.rays(x_px, y_px)))
 
     def reported_stars(self, solved: Solved) -> tuple[ReportedStar, ...]:
         """The brightest stars of an exposure, as a tracker reports them."""
-        found, pairs, gain = (
-            solved.found,
-            solved.identified,
-            self._detector.settings.gain_e_per_dn,
-        )
-        hip = (
-            {}
-            if pairs is None
-            else dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
-        )
+        stars = solved.found
+        pairs = solved.identified
+        gain = self._detector.settings.gain_e_per_dn
+        if pairs is None:
+            hip = {}
+        else:
+            hip = dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
         return tuple(
             ReportedStar(
-                float(found.x_px[k]),
-                float(found.y_px[k]),
-                float(found.flux_e[k]) / gain,
+                float(stars.x_px[k]),
+                float(stars.y_px[k]),
+                float(stars.flux_e[k]) / gain,
                 hip.get(k) or None,
             )
-            for k in range(min(len(found), MAX_REPORTED))
+            for k in range(min(len(stars), MAX_REPORTED))
         )
 
     def _near(self, q_icrs_to_cam: FloatArray) -> tuple[IntArray, FloatArray]:

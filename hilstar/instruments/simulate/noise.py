@@ -91,7 +91,12 @@ def in_mosaic(mosaic: FloatArray, bayer: str, shape: tuple[int, int]) -> FloatAr
     """What pixels (2, h, w) have of a star and of the mean pixel's background, by those of red,
     green and blue (2, 3).
     """
-    return np.array([in_pixels([np.full(shape, one) for one in each], bayer) for each in mosaic])
+    return np.array(
+        [
+            in_pixels([np.full(shape, channel_value) for channel_value in row_values], bayer)
+            for row_values in mosaic
+        ]
+    )
 
 
 class NoisyStar:
@@ -109,23 +114,27 @@ class NoisyStar:
         phases: int = PHASES,
         mosaic: FloatArray | None = None,
     ) -> None:
-        self.psf, self.detector, self.exposure_s, self.mosaic = psf, detector, exposure_s, mosaic
+        self.psf = psf
+        self.detector = detector
+        self.exposure_s = exposure_s
+        self.mosaic = mosaic
         self.side_px = max(psf.footprint_px | 1, 7)
         phase = (np.arange(phases) + 0.5) / phases - 0.5
         y_px, x_px = (grid.ravel() for grid in np.meshgrid(phase, phase))
         step = SLOPE_STEP_PX
-        seen, sky = self._patterns()
+        star_pattern, sky = self._patterns()
         by_x, by_y = (
             (self.stamps(x_px + dx, y_px + dy) - self.stamps(x_px - dx, y_px - dy)) / (2 * step)
             for dx, dy in ((step, 0.0), (0.0, step))
         )
-        even, count = np.ones_like(by_x), phases**2 * len(seen)
+        even = np.ones_like(by_x)
+        count = phases**2 * len(star_pattern)
         self.shares, *slopes = (
-            (pattern[:, None] * one).reshape(count, -1)
-            for pattern, one in (
-                (seen, self.stamps(x_px, y_px)),
-                (seen, by_x),
-                (seen, by_y),
+            (pattern[:, None] * stamp).reshape(count, -1)
+            for pattern, stamp in (
+                (star_pattern, self.stamps(x_px, y_px)),
+                (star_pattern, by_x),
+                (star_pattern, by_y),
                 (sky, even),
             )
         )
@@ -159,13 +168,13 @@ class NoisyStar:
         """Rows of NOISE_DTYPE of stars of `star_e` (n,) electrons before `background_e` (n,) in
         a pixel, in one exposure.
         """
-        found = np.empty(len(star_e), NOISE_DTYPE)
+        noise_rows = np.empty(len(star_e), NOISE_DTYPE)
         for at in range(0, len(star_e), CHUNK):
             part = slice(at, at + CHUNK)
             self._fill(
-                found[part], star_e[part, None, None], background_e[part, None, None], finder
+                noise_rows[part], star_e[part, None, None], background_e[part, None, None], finder
             )
-        return found
+        return noise_rows
 
     def fisher(self, weight: FloatArray, star_e: FloatArray) -> FloatArray:
         """Information (n, phases, 4, 4) of x, y [px], flux and background [e-], of stars (n,
@@ -184,9 +193,10 @@ class NoisyStar:
     def _fill(
         self, found: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings
     ) -> None:
-        shares, under_e = self.shares, background_e * self._sky
+        shares = self.shares
+        under_e = background_e * self._sky
         light_e = star_e * shares + under_e
-        noise, sky = (self.detector.noise(one, self.exposure_s) for one in (light_e, under_e))
+        noise, sky = (self.detector.noise(light, self.exposure_s) for light in (light_e, under_e))
         unclipped = light_e + noise.dark_e2 <= full_e(self.detector)
         weight = unclipped / noise.total_e2
         by_flux = weight * shares
@@ -223,10 +233,10 @@ class NoisyStar:
             )
             for size in (3, 4)
         )
-        for name, one in zip(
+        for name, light in zip(
             ("x_px", "y_px", "flux_e", "flux_sky_e"), (*known.T, free[:, 2]), strict=True
         ):
-            found[f"bound_{name}"] = one
+            found[f"bound_{name}"] = light
         found["bound_px"] = np.sqrt((found["bound_x_px"] ** 2 + found["bound_y_px"] ** 2) / 2)
         found["effective_px"] = effective_px.mean(axis=(1, 2))
         # somewhere within a pixel nothing is left of them
@@ -266,11 +276,11 @@ class NoisyStar:
             )
             limit_e = finder.threshold_sigma * np.sqrt(dark.mean(axis=(1, 2), keepdims=True))
             above = np.pad(ndtr((light - limit_e) / np.sqrt(variance)), ((0, 0), (0, 1), (0, 1)))
-            each = np.stack(
+            by_place = np.stack(
                 [above[:, y::2, x::2].reshape(len(above), -1) for y in (0, 1) for x in (0, 1)],
                 axis=1,
             )
-            best = each[np.arange(len(each)), np.prod(1 - each, axis=2).argmin(axis=1)]
+            best = by_place[np.arange(len(by_place)), np.prod(1 - by_place, axis=2).argmin(axis=1)]
             return np.asarray(best.reshape(*noise.total_e2.shape[:2], -1))
         # The first code over the threshold begins half a step below it, and rounding is no noise of
         # its own.
@@ -315,7 +325,8 @@ def measured_px(
     TRIALS^2 stars at random places within a pixel, through the detector with all its noise but hot
     and dead pixels. What all are off by in common is no error.
     """
-    side, shape = star.side_px, (TRIALS * star.side_px,) * 2
+    side = star.side_px
+    shape = (TRIALS * star.side_px,) * 2
     plain = {
         "hot_pixel_fraction": 0.0,
         "dead_pixel_fraction": 0.0,
@@ -324,17 +335,19 @@ def measured_px(
     }
     device = Detector(structs.replace(star.detector, blooming=False, **plain), shape)
     place_px = rng.uniform(-0.5, 0.5, (2, TRIALS**2))
-    light_e, under_e = (
+    light_e = (
         (star_e * star.stamps(*place_px))
         .reshape(TRIALS, TRIALS, side, side)
         .swapaxes(1, 2)
-        .reshape(shape),
-        sky_e,
+        .reshape(shape)
     )
-    bayer, superpixel = star.detector.bayer, star.detector.takes_superpixels
+    under_e = sky_e
+    bayer = star.detector.bayer
+    superpixel = star.detector.takes_superpixels
     if star.mosaic is not None and bayer is not None:
-        seen, sky = in_mosaic(star.mosaic, bayer, shape)
-        light_e, under_e = light_e * seen, sky_e * sky
+        star_pattern, sky = in_mosaic(star.mosaic, bayer, shape)
+        light_e = light_e * star_pattern
+        under_e = sky_e * sky
     dn = device.expose(light_e + under_e, star.exposure_s, rng)
     noise = star.detector.noise(sky_e, star.exposure_s)
     seen_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - under_e - noise.dark_e2
@@ -346,13 +359,15 @@ def measured_px(
         * (float(np.sum(SUPERPIXEL**2)) if superpixel else 1.0)
     )
     above = stamps > threshold_e
-    found = above.sum(axis=(1, 2)) >= finder.minimum_pixels
-    if found.sum() < MIN_FOUND:
+    is_detected = above.sum(axis=(1, 2)) >= finder.minimum_pixels
+    if is_detected.sum() < MIN_FOUND:
         return np.full(len(FAMILY), np.nan)
     width_px = software_psf_px(star.psf.width_px, star.detector)
-    off = [
-        np.stack(star_places(stamps[found], kind, width_px)) - place_px[:, found] for kind in FAMILY
-    ]
+    off = []
+    for kind in FAMILY:
+        off.append(
+            np.stack(star_places(stamps[is_detected], kind, width_px)) - place_px[:, is_detected]
+        )
     # an offset of all, as by coma, is the calibration's
     return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))
 
@@ -369,7 +384,8 @@ def field_stars(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray) -> Tabl
 
 def turns_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """What turns about cam's x, y and z do to places (n,): (n, 2, 3), px/rad."""
-    rays, turns = normalise(camera.rays(x_px, y_px)), np.empty((len(x_px), 2, 3))
+    rays = normalise(camera.rays(x_px, y_px))
+    turns = np.empty((len(x_px), 2, 3))
     for k, axis in enumerate(np.eye(3)):
         moved = TURN_RAD * np.cross(axis, rays)
         there, back = (
@@ -395,10 +411,10 @@ def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -
     information += (
         NO_INFORMATION * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     )
-    found = np.full((2, len(usable)), np.inf)
+    nea = np.full((2, len(usable)), np.inf)
     x, y, z = np.linalg.inv(information[usable]).diagonal(axis1=1, axis2=2).T
-    found[:, usable] = ARCSEC_PER_RAD * np.sqrt([(x + y) / 2, z])
-    return found
+    nea[:, usable] = ARCSEC_PER_RAD * np.sqrt([(x + y) / 2, z])
+    return nea
 
 
 @dataclass(frozen=True, slots=True)
@@ -427,12 +443,14 @@ def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -
     """A star on a bench's tracker, of a mosaic one of the Sun's colour before a sky (h, w),
     whole or as a channel sees it.
     """
-    tracker, mosaic, bayer = file.config.tracker, None, file.config.tracker.detector.bayer
+    tracker = file.config.tracker
+    mosaic = None
+    bayer = file.config.tracker.detector.bayer
     if bayer is not None:
         of_star = star_flux(file.config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]
-        levels = [
-            np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]) for one in CHANNELS
-        ]
+        levels = []
+        for one in CHANNELS:
+            levels.append(np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]))
         mosaic = np.array([of_star / of_star.sum(), np.array(levels) / (sky_e.mean() or 1.0)])
         mosaic[0, [k for k in range(len(CHANNELS)) if channel not in (None, k)]] = 0.0
     return NoisyStar(
@@ -452,8 +470,10 @@ def noise_budget(
     Magnitudes are those of stars of the Sun's colour; simulated stars and fields come from `rng`.
     Raises InputError.
     """
-    config, tracker = file.config, file.config.tracker
-    camera, stars = tracker_camera(tracker, file.folder), bench_stars(config, file.folder)
+    config = file.config
+    tracker = file.config.tracker
+    camera = tracker_camera(tracker, file.folder)
+    stars = bench_stars(config, file.folder)
     if not tracker.exposure_s:
         raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
     if not len(stars):
@@ -462,7 +482,8 @@ def noise_budget(
             " magnitude"
         )
     background = TrackerBackground(config, file.folder, camera)
-    sights, levels_e = [], []
+    sights = []
+    levels_e = []
     for q in rng.standard_normal((SKY_FIELDS, 4)) if q_icrs_to_cam is None else q_icrs_to_cam[None]:
         try:
             sky_e = background.of_view_e(View.exposure(normalise(q), STILL, tracker.exposure_s))
@@ -484,7 +505,8 @@ def noise_budget(
     v_mag: FloatArray = math.floor(
         brightest / STEP_MAG
     ) * STEP_MAG + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
-    all_e, under_e = zero_e * flux_ratio(v_mag), np.full(len(v_mag), middle_e)
+    all_e = zero_e * flux_ratio(v_mag)
+    under_e = np.full(len(v_mag), middle_e)
     noise = star.noise(all_e, under_e, finder)
     shown = slice(0, int((noise["detection"][::BETWEEN] >= UNSEEN).sum()) * BETWEEN + 1, BETWEEN)
     measured = np.array(
@@ -507,10 +529,16 @@ def noise_budget(
         bounds = between(noise, star_e)
         if q_icrs_to_cam is not None:
             pixels = np.ceil(np.stack([field["y_px"], field["x_px"]]) - 0.5).astype(np.intp)
-            own = star.noise(star_e, software_image(sky_e, tracker.detector)[tuple(pixels)], finder)
-            bounds = np.stack([own["bound_x_px"], own["bound_y_px"], own["detection"]])
+            own_noise = star.noise(
+                star_e, software_image(sky_e, tracker.detector)[tuple(pixels)], finder
+            )
+            bounds = np.stack(
+                [own_noise["bound_x_px"], own_noise["bound_y_px"], own_noise["detection"]]
+            )
             listed = _rows(
-                {name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")}, own, {}
+                {name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")},
+                own_noise,
+                {},
             )
         turns = turns_of(camera, field["x_px"], field["y_px"])
         others = [
@@ -549,34 +577,37 @@ def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatA
     InputError.
     """
     tracker = file.config.tracker
-    camera, stars = tracker_camera(tracker, file.folder), bench_stars(file.config, file.folder)
-    background, star = TrackerBackground(file.config, file.folder, camera), None
-    found = np.full((len(q_icrs_to_cam), 2), np.inf)
+    camera = tracker_camera(tracker, file.folder)
+    stars = bench_stars(file.config, file.folder)
+    background = TrackerBackground(file.config, file.folder, camera)
+    star = None
+    limits_arcsec = np.full((len(q_icrs_to_cam), 2), np.inf)
     for k, q in enumerate(q_icrs_to_cam):
         field = field_stars(stars, camera, q)
         with contextlib.suppress(InputError):
             sky_e = background.of_view_e(View.exposure(q, STILL, tracker.exposure_s))
             star = star or noisy_star(file, sky_e)
             under_e = np.full(len(field), float(sky_e.mean()))
-            own = star.noise(
+            own_noise = star.noise(
                 field["electrons_per_s"] * tracker.exposure_s, under_e, CentroidSettings()
             )
-            bounds = np.stack([own["bound_x_px"], own["bound_y_px"]])
+            bounds = np.stack([own_noise["bound_x_px"], own_noise["bound_y_px"]])
             nea = nea_arcsec(
-                turns_of(camera, field["x_px"], field["y_px"]), bounds, own["detection"]
+                turns_of(camera, field["x_px"], field["y_px"]), bounds, own_noise["detection"]
             )
-            found[k] = nea[:, -1:].ravel() if nea.size else np.inf
-    return found
+            limits_arcsec[k] = nea[:, -1:].ravel() if nea.size else np.inf
+    return limits_arcsec
 
 
 def between(noise: Table, star_e: FloatArray) -> FloatArray:
     """Bounds of x and y [px] and the probability of detection of other stars (n,), (3, n),
     between those of a table.
     """
-    grid, at = -np.log(noise["star_e"]), -np.log(star_e)
-    bounds = [
-        np.exp(np.interp(at, grid, np.log(noise[name]))) for name in ("bound_x_px", "bound_y_px")
-    ]
+    grid = -np.log(noise["star_e"])
+    at = -np.log(star_e)
+    bounds = []
+    for name in ("bound_x_px", "bound_y_px"):
+        bounds.append(np.exp(np.interp(at, grid, np.log(noise[name]))))
     return np.stack([*bounds, np.interp(at, grid, noise["detection"])])
 
 
@@ -584,7 +615,7 @@ def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[d
     columns = before | {name: noise[name] for name in NOISE_DTYPE.names or ()} | after
     return [
         dict(zip(columns, row, strict=True))
-        for row in zip(*(one.tolist() for one in columns.values()), strict=True)
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True)
     ]
 
 
@@ -594,11 +625,12 @@ def _nea_rows(
     """Medians over fields by the faintest star used, from the first limit at which half of the
     fields have an attitude.
     """
-    first = min(one["v_mag"].min(initial=faintest_v_mag) for one in sights)
+    first = min(sight["v_mag"].min(initial=faintest_v_mag) for sight in sights)
     limits = np.arange(
         math.ceil(first / LIMIT_STEP_MAG) * LIMIT_STEP_MAG, faintest_v_mag, LIMIT_STEP_MAG
     )
-    none, rows = np.full((len(WHO), 2), np.inf), []
+    none = np.full((len(WHO), 2), np.inf)
+    rows = []
     for limit in [*limits.tolist(), faintest_v_mag]:
         counts = [int(np.searchsorted(field["v_mag"], limit, side="right")) for field in sights]
         median = np.median(
@@ -607,8 +639,8 @@ def _nea_rows(
         )
         row = {"v_mag": limit, "stars": float(np.median(counts))}
         rows.append(row | dict(zip(NEA_COLUMNS, median.ravel().tolist(), strict=True)))
-    seen = [math.isfinite(row["limit_about_arcsec"]) for row in rows]
-    return rows[seen.index(True) if any(seen) else -1 :]
+    is_limited = [math.isfinite(row["limit_about_arcsec"]) for row in rows]
+    return rows[is_limited.index(True) if any(is_limited) else -1 :]
 
 
 def write_noise(directory: Path, found: NoiseBudget) -> None:
@@ -617,27 +649,37 @@ def write_noise(directory: Path, found: NoiseBudget) -> None:
     """
     for name, rows in (("noise", found.rows), ("nea", found.nea), ("stars", found.stars)):
         if rows:
-            texts = [
-                ["" if isinstance(v, float) and not math.isfinite(v) else v for v in row.values()]
-                for row in rows
-            ]
+            texts = []
+            for row in rows:
+                texts.append(
+                    [
+                        "" if isinstance(v, float) and not math.isfinite(v) else v
+                        for v in row.values()
+                    ]
+                )
             write_csv(directory / f"{name}.csv", list(rows[0]), texts)
     if math.isfinite(found.nea_arcsec["limit"]["about"]):
         _draw(directory / "nea", found)
 
 
 def _draw(path: Path, found: NoiseBudget) -> None:
-    last, own = found.nea_arcsec, found.centroider
-    limit, reached = (" and ".join(map(two_digits, last[kind].values())) for kind in ("limit", own))
+    last = found.nea_arcsec
+    centroider = found.centroider
+    limit, reached = (
+        " and ".join(map(two_digits, last[kind].values())) for kind in ("limit", centroider)
+    )
     finding = (
         f"Stars to V = {found.nea[-1]['v_mag']:g} allow {limit} arcsec across and about the"
         " boresight;"
     )
-    finding += f" {own} reaches {reached}"
-    where = "the field" if found.fields == 1 else f"{found.fields} fields all over the sky, median"
+    finding += f" {centroider} reaches {reached}"
+    if found.fields == 1:
+        where = "the field"
+    else:
+        where = f"{found.fields} fields all over the sky, median"
     note = (
         f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated"
-        f" {own}."
+        f" {centroider}."
     )
     with chart(path, finding, 1, 2, note=note, share_x=False, share_y=True) as panels:
         for axes, key, label in zip(
@@ -646,7 +688,7 @@ def _draw(path: Path, found: NoiseBudget) -> None:
             # the last one of a number of stars
             rows = list({row[key]: row for row in found.nea}.values())
             for way, colour in (("about", ORANGE), ("across", BLUE)):
-                for kind, style in ((own, "--"), ("limit", "-")):
+                for kind, style in ((centroider, "--"), ("limit", "-")):
                     values = [row[f"{kind}_{way}_arcsec"] for row in rows]
                     name = f"{way}, {kind}" if key == "stars" else "_"
                     axes.semilogy(
@@ -660,32 +702,29 @@ def _draw(path: Path, found: NoiseBudget) -> None:
 
 def noise_lines(found: NoiseBudget) -> Iterator[str]:
     """The budget for a person."""
-    own = found.centroider
+    centroider = found.centroider
     threshold = f"{found.minimum_pixels} px above {found.threshold_sigma:g} sigma"
     yield (
         f"{'found':22}{threshold} of a background of {found.background_e_per_px:.4g} e- in a pixel"
     )
-    for name, one in found.channels.items():
+    for name, channel_noise in found.channels.items():
         figures = (
-            f"{one['star_share']:.1%} of a star of the Sun's colour, background"
-            f" {one['background_e_per_px']:.4g} e-"
+            f"{channel_noise['star_share']:.1%} of a star of the Sun's colour, background"
+            f" {channel_noise['background_e_per_px']:.4g} e-"
         )
         yield f"{'pixels of ' + name:22}{figures}"
     for kind, nea in found.nea_arcsec.items():
-        told = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
-        told = (
-            told
-            if math.isfinite(nea["about"])
-            else f"none: fewer than {MIN_STARS} stars with a place"
-        )
-        yield f"{'NEA, ' + kind:22}{told}"
+        nea_text = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
+        if not math.isfinite(nea["about"]):
+            nea_text = f"none: fewer than {MIN_STARS} stars with a place"
+        yield f"{'NEA, ' + kind:22}{nea_text}"
     yield ""
     snr = [f"snr_{name}" for name in found.channels]
     titles = "".join(f"{'SNR ' + name:>8}" for name in found.channels)
     sums = f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}"
-    yield f"{sums}{titles}{'detection':>11}{'bound px':>10}{own + ' px':>12}"
+    yield f"{sums}{titles}{'detection':>11}{'bound px':>10}{centroider + ' px':>12}"
     for row in found.rows:
-        reached = row[f"{own}_px"]
+        reached = row[f"{centroider}_px"]
         yield (
             f"{row['v_mag']:6.1f}{row['star_e']:12.4g}{row['total_e']:11.4g}"
             f"{''.join(f'{row[name]:8.1f}' for name in ('snr', *snr))}{row['detection']:11.4f}"

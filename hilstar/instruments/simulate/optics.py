@@ -51,12 +51,14 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     """The primaries of a bench before its tracker's optics: one for all where they are not
     driven apart.
     """
-    colours, psf = bench.colours, bench.tracker_psf
+    colours = bench.colours
+    psf = bench.tracker_psf
     if colours is None:
         return ALL_ALIKE
-    spectra = (
-        colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm) if psf.by_colour else None
-    )
+    if psf.by_colour:
+        spectra = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
+    else:
+        spectra = None
     places = [(float(x), float(y)) for x, y in colours.places_px]
     return tuple(
         Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places)
@@ -81,8 +83,12 @@ class DisplayColours:
         """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean
         colour of the stars.
         """
-        config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
-        bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)
+        config = bench.config
+        colours = bench.colours
+        stars = bench.stars
+        folder = bench.file.folder
+        bayer = config.tracker.detector.bayer
+        primaries = bench_primaries(config.monitor, folder)
         if bayer is None or stars.colours is None:
             return cls(None, np.empty((0, 0)), np.empty(0))
         if colours is not None:
@@ -102,11 +108,9 @@ class DisplayColours:
 
     def grey(self, image: FloatArray) -> FloatArray:
         """The black level's light (h, w) in the detector's pixels."""
-        return (
-            image
-            if self.bayer is None
-            else in_pixels(np.multiply.outer(self.white, image), self.bayer)
-        )
+        if self.bayer is None:
+            return image
+        return in_pixels(np.multiply.outer(self.white, image), self.bayer)
 
 
 class TwinOptics(Closing):
@@ -131,11 +135,12 @@ class TwinOptics(Closing):
         """Electrons per second of each tracker pixel by each primary's light: (primaries, h, w),
         float64.
         """
-        images = [
-            self.image_e_per_s(light, one)
-            for light, one in zip(lights_e_per_s, primaries, strict=True)
-        ]
-        return np.array(images) if len(images) > 1 else images[0][None]
+        images = []
+        for light, primary in zip(lights_e_per_s, primaries, strict=True):
+            images.append(self.image_e_per_s(light, primary))
+        if len(images) > 1:
+            return np.array(images)
+        return images[0][None]
 
     def image_e_per_s(
         self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]
@@ -143,14 +148,19 @@ class TwinOptics(Closing):
         """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit
         ones or all (H, W), float64.
         """
-        lit = light_e_per_s if isinstance(light_e_per_s, LitLight) else LitLight.of(light_e_per_s)
+        if isinstance(light_e_per_s, LitLight):
+            lit = light_e_per_s
+        else:
+            lit = LitLight.of(light_e_per_s)
         lit = self._near_the_detector(lit, primary)
         at_once = POINTS_AT_ONCE // len(self._steps) ** 2
         total = self._points(lit.part(0, at_once), primary)
         for begin in range(at_once, len(lit.place), at_once):
             total += self._points(lit.part(begin, begin + at_once), primary)
         # a measured PSF may be negative somewhere
-        return np.maximum(total, 0.0) if self._psf.by_colour else total
+        if self._psf.by_colour:
+            return np.maximum(total, 0.0)
+        return total
 
     def _near_the_detector(self, lit: LitLight, primary: Primary) -> LitLight:
         """The lit pixels that may light the detector, of a screen that it may see a small part
@@ -172,11 +182,16 @@ class TwinOptics(Closing):
             (columns + dx).ravel(), (rows + dy).ravel(), primary.place_px
         )
         light = np.repeat(lit.e_per_s / len(dx), len(dx))
-        star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
+        star = np.zeros(len(light), dtype=np.intp)
+        size_px = self.geometry.tracker.resolution_px
         sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
         if self._psf.by_colour:  # grey light has no spectrum here
-            shares = self._psf.mean_shares if primary.shares is None else primary.shares
-            at_px, rates = (sprites.x_px, sprites.y_px), sprites.data["electrons_per_s"]
+            if primary.shares is None:
+                shares = self._psf.mean_shares
+            else:
+                shares = primary.shares
+            at_px = (sprites.x_px, sprites.y_px)
+            rates = sprites.data["electrons_per_s"]
             return self._psf.image(*at_px, shares, rates, size_px).astype(np.float64)
         self._renderer.draw(sprites)
         return self._renderer.linear().astype(np.float64)
@@ -197,7 +212,8 @@ class TwinOptics(Closing):
             below = min(top + rows, height)
             # A density is a slope: of a band's first and last row, too, it needs the rows beside
             # them.
-            first, last = max(top - 1, 0), min(below + 1, height)
+            first = max(top - 1, 0)
+            last = min(below + 1, height)
             glow[top:below] = self._glow_of_rows(panel, first, last)[top - first : below - first]
         return glow
 

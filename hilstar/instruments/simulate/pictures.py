@@ -56,7 +56,8 @@ def write_exposure_fits(
     from astropy.io import fits
 
     tracker = simulator.config.tracker
-    epoch_jyear, q = simulator.config.sky.epoch_jyear, exposure.view.q_icrs_to_cam
+    epoch_jyear = simulator.config.sky.epoch_jyear
+    q = exposure.view.q_icrs_to_cam
     header = sky_header(simulator.file.sha256, epoch_jyear, q, simulator.camera)
     header["BUNIT"] = ("adu", "digital numbers (DN)")
     header["EXPTIME"] = (tracker.exposure_s, "[s]")
@@ -126,14 +127,18 @@ class TrackerPictures:
         now: Callable[[], tuple[Now, ...]] = tuple,
     ) -> None:
         self._simulator = Simulator(bench.file, bench.renderer.context, refuse=False)
-        self._noise, self._count = FrameNoise("full"), 0
+        self._noise = FrameNoise("full")
+        self._count = 0
         self._now = now
         self._stood: View | None = None
         self._view = simulator_view(self._simulator, scenario)
 
     def __call__(self, sample: AttitudeSample) -> bytes:
         """The picture of the tracker at an attitude."""
-        rate = STILL if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
+        if sample.rate_cam_rad_s is None:
+            rate = STILL
+        else:
+            rate = sample.rate_cam_rad_s
         view = self._simulator.view(
             sample.q_icrs_to_cam, rate, sample.t_ns, sample.velocity_km_s, sample.place_km
         )
@@ -147,11 +152,13 @@ class TrackerPictures:
         attitude at which it does.
         """
         now = self._now()
-        if not any(isinstance(one.fault, Freeze | Drop) for one in now):
+        if not any(isinstance(active.fault, Freeze | Drop) for active in now):
             self._stood = view
         elif self._stood is not None:
             stood = self._stood
             view = replace(
                 view, q_icrs_to_cam=stood.q_icrs_to_cam, rate_cam_rad_s=STILL, t_ns=stood.t_ns
             )
-        return FaultyExposure(self._view, (ExposurePiece(view, now),)) if now else None
+        if now:
+            return FaultyExposure(self._view, (ExposurePiece(view, now),))
+        return None

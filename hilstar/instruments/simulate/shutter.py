@@ -75,7 +75,8 @@ class RowBeat:
         `screen_late_s` (n,) is how long after its middle row the screen lights a place,
         `row_late_s` (n,) how long after its own the tracker exposes it.
         """
-        begin, exposed = self.begin_s(frame) + screen_late_s, row_late_s - self.rows.hold_s / 2
+        begin = self.begin_s(frame) + screen_late_s
+        exposed = row_late_s - self.rows.hold_s / 2
         lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(
             begin, exposed
         )
@@ -90,7 +91,10 @@ def rolling_light(
 
     Frames begin at the view's time, at `phase_s` as in `RowBeat`.
     """
-    config, screen, moving, turn = bench.config, bench.scan, bench.moving, view.turn
+    config = bench.config
+    screen = bench.scan
+    moving = bench.moving
+    turn = view.turn
     beat = RowBeat(view.scan, screen, 1 / config.monitor.refresh_hz, phase_s)
     sizes = config.monitor.resolution_px, config.tracker.resolution_px
     changes = (
@@ -98,17 +102,22 @@ def rolling_light(
     )
     changes |= moving is not None and moving.satellites is not None
     compensated = config.render.motion == "on"
-    total, shown = np.zeros((len(panel.primaries) or 1, *sizes[0][::-1])), None
+    total = np.zeros((len(panel.primaries) or 1, *sizes[0][::-1]))
+    shown = None
     y, x = (part.ravel().astype(np.float64) for part in np.indices(sizes[1][::-1]))
     glow_late_s = np.nan_to_num(
         screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0])
     )
-    glow_rows_s, glow = view.scan.late_s(x, y, sizes[1]), np.zeros(x.shape)
+    glow_rows_s = view.scan.late_s(x, y, sizes[1])
+    glow = np.zeros(x.shape)
     for number, frame in enumerate(beat.frames):
         if changes or shown is None:
             seconds = beat.begin_s(frame) + (0.0 if compensated else beat.hold_s / 2)
             q = propagate(view.q_icrs_to_cam, turn.rate_cam_rad_s, seconds)
-            t_ns = None if view.t_ns is None else view.t_ns + round(seconds * NS_PER_S)
+            if view.t_ns is None:
+                t_ns = None
+            else:
+                t_ns = view.t_ns + round(seconds * NS_PER_S)
             rate = turn.rate_cam_rad_s if compensated else None
             shown = np.array(primary_lights(bench.draw(q, number, rate, t_ns=t_ns).levels, panel))
             rows, columns = np.nonzero(shown.any(axis=0))

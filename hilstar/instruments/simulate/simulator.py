@@ -98,11 +98,9 @@ class FrameNoise:
 
     def rng(self, *number: int) -> np.random.Generator | None:
         """The generator of a frame, or of frame `number` of several; None without noise."""
-        return (
-            np.random.default_rng((self.seed, *number) if number else self.seed)
-            if self.kind == "full"
-            else None
-        )
+        if self.kind == "full":
+            return np.random.default_rng((self.seed, *number) if number else self.seed)
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +141,9 @@ class Simulator(Closing):
         refuse: bool = True,
         psf: Psf | None = None,
     ) -> None:
-        self.file, self._refuse, self._psf = file, refuse, psf
+        self.file = file
+        self._refuse = refuse
+        self._psf = psf
         self.config = file.config
         self._load_sky()
         self._load_tracker()
@@ -182,7 +182,9 @@ class Simulator(Closing):
         """
         if file.config == self.config and file.sha256 == self.file.sha256:
             return
-        before, self.file, self.config = self.config, file, file.config
+        before = self.config
+        self.file = file
+        self.config = file.config
         if self.moving is not None or _sky_keys(before) != _sky_keys(self.config):
             self._load_sky()
         if _tracker_keys(before) != _tracker_keys(self.config):
@@ -229,11 +231,9 @@ class Simulator(Closing):
         """One frame; without a generator, without noise. Raises InputError for what a detector
         cannot take.
         """
-        exposure_s, canvas, view = (
-            self.config.tracker.exposure_s,
-            self.canvas,
-            rolled(view, self.config.tracker),
-        )
+        exposure_s = self.config.tracker.exposure_s
+        canvas = self.canvas
+        view = rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
         if self.moving is not None and self.moving.air is not None and rng is not None:
             stars = self.moving.air.twinkling(stars, self.moving.utc_ns(view.t_ns), exposure_s, rng)
@@ -258,14 +258,13 @@ class Simulator(Closing):
             mean_e = np.minimum(mean_e, BODY_MAX_E)
         if self.glass is not None:  # a measured PSF may be negative somewhere
             np.maximum(mean_e, 0.0, out=mean_e)
-        dn, truth = (
-            self._digitised(mean_e, rng),
-            exposure_truth(canvas, view, stars, light, mean_e, self.glass),
-        )
+        dn = self._digitised(mean_e, rng)
+        truth = exposure_truth(canvas, view, stars, light, mean_e, self.glass)
         truth = with_errors(truth, stars.catalog, self.config.sky.epoch_jyear)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
-        added, by_bv = _exposed(faults.added_truth()), stars.colours_by_bv
+        added = _exposed(faults.added_truth())
+        by_bv = stars.colours_by_bv
         added = with_channels(added, None if by_bv is None else shares_by_bv(by_bv, added["bv"]))
         truth = np.concatenate([truth, added])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
@@ -280,7 +279,10 @@ class Simulator(Closing):
 
     def _exposed_e(self, sprites: FrameLight, stars: Stars, seconds: float) -> FloatArray:
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
-        channels = [sprites] if self._bayer is None else by_channel(sprites, stars)
+        if self._bayer is None:
+            channels = [sprites]
+        else:
+            channels = by_channel(sprites, stars)
         images = (
             self._image(light, stars, glass)
             for light, glass in zip(channels, self._glasses, strict=True)
@@ -339,10 +341,11 @@ def pieces_of(
     where = attitude_at or at_constant_rate
     half_ns = round(view.exposure_s * NS_PER_S / 2)
     edges = timetable.edges_ns(run_ns - half_ns, run_ns + half_ns)
-    found = []
+    pieces = []
     for begin_ns, end_ns in itertools.pairwise(edges):
         middle_ns = (begin_ns + end_ns) // 2
-        since_ns, now = timetable.stands_since_ns(middle_ns), timetable.on(middle_ns, begin_ns)
+        since_ns = timetable.stands_since_ns(middle_ns)
+        now = timetable.on(middle_ns, begin_ns)
         part = replace(
             view,
             q_icrs_to_cam=at_constant_rate(middle_ns) if since_ns is None else where(since_ns),
@@ -350,15 +353,16 @@ def pieces_of(
             t_ns=None if view.t_ns is None else view.t_ns + middle_ns - run_ns,
             scan=Scan(hold_s=(end_ns - begin_ns) / NS_PER_S),
         )
-        found.append(ExposurePiece(part, now))
-    return tuple(found)
+        pieces.append(ExposurePiece(part, now))
+    return tuple(pieces)
 
 
 class FaultyExposure:
     """One exposure with its faults, as `Simulator.expose` draws it, piece by piece."""
 
     def __init__(self, view: FaultView, pieces: Sequence[ExposurePiece]) -> None:
-        self._view, self.pieces = view, pieces
+        self._view = view
+        self.pieces = pieces
         self._seen: list[FrameLight] = []
         self._rows: list[tuple[npt.NDArray[np.void], float]] = []
 
@@ -377,7 +381,8 @@ class FaultyExposure:
         open_s = 0.0
         exposure_s = sum(piece.view.exposure_s for piece in self.pieces)
         for piece in self.pieces:
-            layer, piece_s = FaultLayer(self._view, piece.now), piece.view.exposure_s
+            layer = FaultLayer(self._view, piece.now)
+            piece_s = piece.view.exposure_s
             sprites = light_of(layer.turned(piece.view), layer)
             light = exposed_e(sprites, piece_s)
             total = light if total is None else total + light
@@ -395,7 +400,9 @@ class FaultyExposure:
     @property
     def names(self) -> tuple[str, ...]:
         """The faults that are on in it."""
-        return tuple(dict.fromkeys(one.fault.name for piece in self.pieces for one in piece.now))
+        return tuple(
+            dict.fromkeys(active.fault.name for piece in self.pieces for active in piece.now)
+        )
 
     def sprites(self) -> FrameLight:
         """The sprites of the bench's own stars and discs in any of its pieces, end to end."""
@@ -409,32 +416,33 @@ class FaultyExposure:
         exposure, at the mean place.
         """
         tracks = {
-            one.fault.name
+            active.fault.name
             for piece in self.pieces
-            for one in piece.now
-            if isinstance(one.fault, CosmicRays)
+            for active in piece.now
+            if isinstance(active.fault, CosmicRays)
         }
         points: dict[str, npt.NDArray[np.void]] = {}
-        found: list[npt.NDArray[np.void]] = []
+        tables: list[npt.NDArray[np.void]] = []
         for rows, share in self._rows:
             rows["electrons_per_s"] *= share
             for row in rows:
                 name = str(row["name"])
                 if name in tracks:
-                    found.append(row)
+                    tables.append(row)
                 elif name in points:
                     _merge(points[name], row)
                 else:
                     points[name] = row.copy()
-        made = np.zeros(len(points) + len(found), dtype=TRUTH_DTYPE)
-        for k, row in enumerate([*points.values(), *found]):
+        made = np.zeros(len(points) + len(tables), dtype=TRUTH_DTYPE)
+        for k, row in enumerate([*points.values(), *tables]):
             made[k] = row
         return made
 
 
 def _merge(into: npt.NDArray[np.void], row: npt.NDArray[np.void]) -> None:
     """Add the light of the same point in another piece of the exposure."""
-    before, more = float(into["electrons_per_s"]), float(row["electrons_per_s"])
+    before = float(into["electrons_per_s"])
+    more = float(row["electrons_per_s"])
     for place in ("x_px", "y_px"):
         into[place] = (into[place] * before + row[place] * more) / (before + more)
     into["electrons_per_s"] = before + more
@@ -444,10 +452,16 @@ def _own(sprites: FrameLight) -> FrameLight:
     """Sprites without light that a fault adds."""
     if not sprites.added:
         return sprites
-    own = sprites.star >= 0
-    x_px, y_px = sprites.x_px[own], sprites.y_px[own]
+    is_star = sprites.star >= 0
+    x_px = sprites.x_px[is_star]
+    y_px = sprites.y_px[is_star]
     return replace(
-        sprites, data=sprites.data[own], star=sprites.star[own], x_px=x_px, y_px=y_px, added=()
+        sprites,
+        data=sprites.data[is_star],
+        star=sprites.star[is_star],
+        x_px=x_px,
+        y_px=y_px,
+        added=(),
     )
 
 
@@ -482,10 +496,12 @@ def exposure_truth(
     """
     star = np.append(np.unique(light.star), disc_stars(stars, light.discs))
     icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, canvas.camera)[0]
-    seen = stars.directions(star) @ icrs_to_image.T
-    x_px, y_px = canvas.camera.project(seen)
+    image_directions = stars.directions(star) @ icrs_to_image.T
+    x_px, y_px = canvas.camera.project(image_directions)
     if view.scan.scanout_s and view.turns:
-        paths = Paths(seen, canvas.camera.cam_to_image @ view.turn.rate_cam_rad_s, canvas.camera)
+        paths = Paths(
+            image_directions, canvas.camera.cam_to_image @ view.turn.rate_cam_rad_s, canvas.camera
+        )
         x_px, y_px = paths.places_px(
             EVERY, own_row_s(paths, EVERY, np.zeros(len(star)), view.scan)[0]
         )
@@ -501,11 +517,11 @@ def exposure_truth(
         mean_e = maximum_filter(mean_e, CLIPPED_PX)
     truth["clipped"][inside] = mean_e[place] > canvas.full_e
     if glass is not None:
-        found = glass.psf.centroids_px(
+        centroids = glass.psf.centroids_px(
             x_px[inside], y_px[inside], glass.shares(stars, star[inside])
         )
         for name, value in zip(
-            ("x_centroid_px", "y_centroid_px", "relative_illumination"), found, strict=True
+            ("x_centroid_px", "y_centroid_px", "relative_illumination"), centroids, strict=True
         ):
             truth[name][inside] = value
     truth["clipped"] |= np.isin(truth["name"], light.over_white)
@@ -515,15 +531,15 @@ def exposure_truth(
 
 def _exposed(truth: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     """Rows of EXPOSURE_DTYPE, of TRUTH_DTYPE: all light at its place, and no vignetting."""
-    found = np.zeros(len(truth), dtype=EXPOSURE_DTYPE)
+    exposed = np.zeros(len(truth), dtype=EXPOSURE_DTYPE)
     for name in TRUTH_DTYPE.names or ():
-        found[name] = truth[name]
-    found["x_centroid_px"], found["y_centroid_px"], found["relative_illumination"] = (
+        exposed[name] = truth[name]
+    exposed["x_centroid_px"], exposed["y_centroid_px"], exposed["relative_illumination"] = (
         truth["x_px"],
         truth["y_px"],
         1.0,
     )
-    return found
+    return exposed
 
 
 def full_e(detector: DetectorSettings) -> float:
@@ -605,14 +621,18 @@ class TrackerBackground:
         directions = self._rays @ to_matrix(view.q_icrs_to_cam)
         rates: list[FloatArray] = []
         if self._lights:
-            seen = sunward(directions, sky_jd(self._config, view.t_ns))
-            found = tabled_light(seen)
-            self._say(float(seen.elongation_deg.min()), beyond=not found.tabled.all())
-            rates = [light.electrons_per_s_sr(seen, found) for light in self._lights]
+            sun_angles = sunward(directions, sky_jd(self._config, view.t_ns))
+            zodiacal = tabled_light(sun_angles)
+            self._say(float(sun_angles.elongation_deg.min()), beyond=not zodiacal.tabled.all())
+            rates = [light.electrons_per_s_sr(sun_angles, zodiacal) for light in self._lights]
         if self._moving is not None and self._moving.air is not None:
             glow = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
-            glow = glow if self._bayer is not None else glow.sum(axis=0, keepdims=True)
-            rates = list(glow) if not rates else [a + b for a, b in zip(rates, glow, strict=True)]
+            if self._bayer is None:
+                glow = glow.sum(axis=0, keepdims=True)
+            if not rates:
+                rates = list(glow)
+            else:
+                rates = [a + b for a, b in zip(rates, glow, strict=True)]
         by_place = self._sr * self._config.tracker.exposure_s
         images = (self._over_pixels(rate * by_place) for rate in rates)
         return np.asarray(self.steady_e + in_pixels(images, self._bayer))
@@ -641,7 +661,8 @@ def background_e(config: BenchConfig, optics: Optics, pixel_sr: FloatArray) -> F
     Zodiacal light is V mag/arcsec^2 through the tracker's optics, times each pixel's solid angle,
     `pixel_sr` (height, width) (thesis eq. 4.10 and 4.11, which gives all pixels the middle one's).
     """
-    tracker, background = config.tracker, config.background
+    tracker = config.tracker
+    background = config.background
     width, height = tracker.resolution_px
     level_e = np.full((height, width), background.electrons_per_px or 0.0)
     if background.zodiacal_v_mag_arcsec2 is not None:

@@ -57,9 +57,12 @@ class Matched:
 
     def against(self, other: "Matched", k: IntArray) -> Difference:
         """Stars `k` (n,) against themselves in another image."""
-        difference, a, b = Difference(*np.full((3, len(k)), np.nan)), self.found, other.found
+        difference = Difference(*np.full((3, len(k)), np.nan))
+        a = self.found
+        b = other.found
         both = np.flatnonzero((self.index[k] >= 0) & (other.index[k] >= 0))
-        i, j = self.index[k[both]], other.index[k[both]]
+        i = self.index[k[both]]
+        j = other.index[k[both]]
         difference.flux_mag[both] = magnitude(np.maximum(a.flux[i] / b.flux[j], 0.0))
         difference.x_px[both], difference.y_px[both] = a.x_px[i] - b.x_px[j], a.y_px[i] - b.y_px[j]
         return difference
@@ -90,8 +93,8 @@ class StarFinder:
         A tracker subtracts the screen's glow around each star: here it is not added in the first
         place.
         """
-        found = find_stars(image_e, self.settings, self.background)
-        return Matched(found, nearest(found, x_px, y_px))
+        stars_found = find_stars(image_e, self.settings, self.background)
+        return Matched(stars_found, nearest(stars_found, x_px, y_px))
 
     def placed(
         self,
@@ -107,13 +110,15 @@ class StarFinder:
         A box is about the pixel of the star's true place, or as many whole pixels aside as the star
         is.
         """
-        found, stars = matched.found, np.flatnonzero(matched.index >= 0)
+        stars_found = matched.found
+        stars = np.flatnonzero(matched.index >= 0)
         if kind == "window" or not len(stars):
             return matched
-        index, reach = matched.index[stars], self.settings.radius_px
+        index = matched.index[stars]
+        reach = self.settings.radius_px
         aside = (
-            np.rint(seen[index] - true[stars])
-            for seen, true in zip((found.x_px, found.y_px), true_px, strict=True)
+            np.rint(seen_px[index] - true[stars])
+            for seen_px, true in zip((stars_found.x_px, stars_found.y_px), true_px, strict=True)
         )
         column, row = (
             np.rint(true[stars] + by).astype(np.intp)
@@ -126,9 +131,10 @@ class StarFinder:
             dx_px, dy_px = psf_places(
                 stamps, told_psf(self.told, (row, column), 2 * reach + 1), (dx_px, dy_px)
             )
-        x_px, y_px = found.x_px.copy(), found.y_px.copy()
+        x_px = stars_found.x_px.copy()
+        y_px = stars_found.y_px.copy()
         x_px[index], y_px[index] = column + dx_px, row + dy_px
-        return Matched(replace(found, x_px=x_px, y_px=y_px), matched.index)
+        return Matched(replace(stars_found, x_px=x_px, y_px=y_px), matched.index)
 
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
@@ -140,12 +146,12 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * psf.peak_share
     peak_e *= 1.0 if bench.config.tracker.detector.bayer is None else MOSAIC_SHARE
     under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
-    told = None
+    stated_psf = None
     if bench.config.verify.centroider == "psf" and not isinstance(bench.tracker_psf, GaussianPsf):
-        told = bench.tracker_psf.blurred(
+        stated_psf = bench.tracker_psf.blurred(
             float(np.sqrt(np.mean(_shown_px2(bench, monitor_px_per_px))))
         )
-    return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL, told)
+    return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL, stated_psf)
 
 
 def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
@@ -154,7 +160,8 @@ def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
     """
     spread = _shown_px2(bench, monitor_px_per_px)
     x, y = (
-        math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True)
+        math.sqrt(a + width_px**2)
+        for a, width_px in zip(spread, bench.tracker_psf.width_px, strict=True)
     )
     return GaussianPsf(software_psf_px((x, y), bench.config.tracker.detector))
 
@@ -175,12 +182,12 @@ def faintest_e_per_s(bench: Bench) -> float:
 
 def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
     """For each place (n,) the star found nearest within MATCH_PX, -1 for none."""
-    place, seen, distance = neighbours(
+    place, seen_row, distance = neighbours(
         np.stack([x_px, y_px], axis=1), np.stack([found.x_px, found.y_px], axis=1), MATCH_PX
     )
     index = np.full(len(x_px), -1, dtype=np.intp)
     order = np.argsort(-distance, kind="stable")
-    index[place[order]] = seen[order]  # the nearest is written last
+    index[place[order]] = seen_row[order]  # the nearest is written last
     return index
 
 
@@ -194,14 +201,16 @@ def neighbours(
     0.1 s.
     """
     order = np.argsort(others[:, 0])
-    x, at = others[order, 0], np.nan_to_num(places[:, 0], nan=np.inf)
-    first, end = np.searchsorted(x, at - within), np.searchsorted(x, at + within, side="right")
+    x = others[order, 0]
+    at = np.nan_to_num(places[:, 0], nan=np.inf)
+    first = np.searchsorted(x, at - within)
+    end = np.searchsorted(x, at + within, side="right")
     count = end - first
-    one = np.repeat(np.arange(len(places)), count)
-    other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
-    distance = np.hypot(*(places[one] - others[other]).T)
+    place_row = np.repeat(np.arange(len(places)), count)
+    other = order[np.arange(len(place_row)) + np.repeat(first - np.cumsum(count) + count, count)]
+    distance = np.hypot(*(places[place_row] - others[other]).T)
     near = distance <= within
-    return one[near], other[near], distance[near]
+    return place_row[near], other[near], distance[near]
 
 
 def shared(match: IntArray) -> npt.NDArray[np.bool_]:
@@ -216,11 +225,9 @@ def crowded(
     """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their
     own light.
     """
-    places, half, result = (
-        np.stack([x_px, y_px], axis=1),
-        radius_px + 0.5,
-        np.zeros(len(flux), dtype=np.bool_),
-    )
+    places = np.stack([x_px, y_px], axis=1)
+    half = radius_px + 0.5
+    result = np.zeros(len(flux), dtype=np.bool_)
     a, b, _ = neighbours(places, places, math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px))
     a, b = a[a != b], b[a != b]
     offset = places[b] - np.rint(places[a])

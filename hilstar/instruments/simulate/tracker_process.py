@@ -74,7 +74,9 @@ class PlantedErrors:
     """Turns attitudes into those that a tracker with these errors reports."""
 
     def __init__(self, planted: Planted, focal_length_px: float, rng: np.random.Generator) -> None:
-        self._planted, self._focal_px, self._rng = planted, focal_length_px, rng
+        self._planted = planted
+        self._focal_px = focal_length_px
+        self._rng = rng
         self._star: FloatArray | None = None  # on the boresight of the first answer, ICRS
 
     def reported(self, q_icrs_to_cam: FloatArray) -> tuple[FloatArray, bool]:
@@ -84,8 +86,8 @@ class PlantedErrors:
         axes = to_matrix(q_icrs_to_cam)
         if self._star is None:
             self._star = axes[2].copy()
-        seen = axes @ self._star
-        place_px = self._focal_px * seen[:2] / max(seen[2], MIN_FORWARD)
+        star_in_cam = axes @ self._star
+        place_px = self._focal_px * star_in_cam[:2] / max(star_in_cam[2], MIN_FORWARD)
         x, y = 2 * np.pi * place_px / FOV_PERIOD_PX
         of_field = np.array([np.sin(x), np.sin(y + 0.3), np.sin((x + y) / 1.7)])
         x, y = 2 * np.pi * place_px
@@ -103,7 +105,8 @@ class OwnClock:
     """
 
     def __init__(self, planted: Planted, begun_ns: int) -> None:
-        self._begun_ns, self._rate = begun_ns, 1 + 1e-6 * planted.drift_ppm
+        self._begun_ns = begun_ns
+        self._rate = 1 + 1e-6 * planted.drift_ppm
         self._offset_ns = round(planted.offset_s * NS_PER_S)
 
     def of_host(self, host_ns: int) -> int:
@@ -171,7 +174,9 @@ class TrackerProcess:
     ) -> None:
         self.tally = TrackerTally()
         self._camera = camera
-        self._tracker, self._watch, self._planted = tracker, watch, planted
+        self._tracker = tracker
+        self._watch = watch
+        self._planted = planted
         self._period_ns = round(NS_PER_S / rate_hz)
         self._errors = PlantedErrors(planted, tracker.camera.focal_length_px, rng)
         self._waiting: list[tuple[int, int, Answer]] = []  # when it is due, ns, and its number
@@ -210,7 +215,8 @@ class TrackerProcess:
         self, begin_ns: int, send: Send | None, stop: threading.Event, times: ExposureTimes
     ) -> None:
         """One exposure: its image to the camera, its answer to `send`."""
-        tracker, camera = self._tracker, self._camera
+        tracker = self._tracker
+        camera = self._camera
         if camera is not None:
             tracker.adjust(camera.settings.exposure_s, camera.settings.gain_db)
         end_ns = begin_ns + round(tracker.exposure_s * NS_PER_S)
@@ -223,7 +229,10 @@ class TrackerProcess:
         dn = tracker.expose(exposed)
         if camera is not None:
             camera.take(dn, begin_ns)
-        solved = None if send is None else tracker.solve(exposed, dn)
+        if send is None:
+            solved = None
+        else:
+            solved = tracker.solve(exposed, dn)
         self.tally.cpu_ms.add(1e3 * (time.process_time() - cpu_s))
         times.done()
         acquired = False
@@ -242,7 +251,7 @@ class TrackerProcess:
             and self._tracker.frames.newest_ns < end_ns
             and self._host.now_ns() < end_ns + GRACE_NS
         ):
-            due_ns = min([end_ns + GRACE_NS, *(each[0] for each in self._waiting[:1])])
+            due_ns = min([end_ns + GRACE_NS, *(waiting[0] for waiting in self._waiting[:1])])
             self._take(min(SLICE_MS, max(1, math.ceil((due_ns - self._host.now_ns()) / NS_PER_MS))))
             self._put(send)
 
@@ -251,7 +260,9 @@ class TrackerProcess:
             self._tracker.take(frame)
 
     def _report(self, solved: Solved) -> None:
-        tally, q, wrong = self.tally, None, False
+        tally = self.tally
+        q = None
+        wrong = False
         middle_ns = solved.exposed.middle_ns
         since_s = (middle_ns - self._begun_ns) / NS_PER_S
         tally.modes[solved.mode] += 1
@@ -268,7 +279,10 @@ class TrackerProcess:
         tally.answers += 1
         tally.valid += q is not None
         tally.wrong += wrong
-        stars = 0 if solved.identified is None else len(solved.identified.star)
+        if solved.identified is None:
+            stars = 0
+        else:
+            stars = len(solved.identified.star)
         answer = Answer(
             host_ns=middle_ns,
             raw=b"",

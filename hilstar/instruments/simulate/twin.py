@@ -73,12 +73,17 @@ def exposure_lights(
             sprites = bench.light(bench.view(frame.q_icrs_to_cam, None, frame.t_ns), faults)
             levels = bench.draw_sprites(sprites, first_frame + number).levels
         if number in exposed:
-            lit = [[lit_light(*each) for each in primary_levels(levels, panel)] for panel in panels]
+            lit = [
+                [lit_light(*primary_level) for primary_level in primary_levels(levels, panel)]
+                for panel in panels
+            ]
             if len(exposed) == 1:
                 return lit
             for whole, part in zip(itertools.chain(*total), itertools.chain(*lit), strict=True):
                 whole.ravel()[part.place] += part.e_per_s
-    return [[LitLight.of(light / len(exposed)) for light in each] for each in total]
+    return [
+        [LitLight.of(light / len(exposed)) for light in primary_level] for primary_level in total
+    ]
 
 
 def true_panel(bench: Bench) -> Panel:
@@ -90,20 +95,20 @@ def true_panel(bench: Bench) -> Panel:
     if verify.true_calibration is None:
         scale = white / bench.flux_at_white_e_per_s
         parts = tuple(
-            replace(one, flux_at_white_e_per_s=scale * one.flux_at_white_e_per_s)
-            for one in bench.panel.primaries
+            replace(primary, flux_at_white_e_per_s=scale * primary.flux_at_white_e_per_s)
+            for primary in bench.panel.primaries
         )
         return Panel(bench.calibration.response, white, bench.uniformity, parts)
     true = true_calibration(
         bench, verify.true_calibration, bit_stealing=bench.config.render.bit_stealing
     )
     response = levels_of(bench.calibration.response, true.response)
-    uniformity, colours = true.uniformity_map(bench.config.monitor.resolution_px), bench.colours
-    parts = (
-        ()
-        if colours is None
-        else primary_panels(bench.file, colours, white, uniformity, verify.true_calibration)
-    )
+    uniformity = true.uniformity_map(bench.config.monitor.resolution_px)
+    colours = bench.colours
+    if colours is None:
+        parts = ()
+    else:
+        parts = primary_panels(bench.file, colours, white, uniformity, verify.true_calibration)
     return Panel(response, white, uniformity, parts)
 
 
@@ -207,22 +212,26 @@ class Twin(Closing):
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
         exposure_s = self.config.tracker.exposure_s
         skies = [self.sky_optics.image_e_per_s(light) * exposure_s for light in frame.light]
-        panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
+        if self.differs:
+            panels = [self.true_panel, self.bench.panel]
+        else:
+            panels = [self.true_panel]
         view = rolled(self._exposure_at(frame), self.config.tracker)
         glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
         lights: Sequence[Iterable[FloatArray | LitLight]]
         if view.scan.scanout_s and exposure_s:
             phase_s = self._phase_s(first_frame)
-            seen = zip((self.true_optics, self.sky_optics), panels, strict=False)
-            parts = [
-                rolling_light(self.bench, optics.geometry, panel, view, phase_s)
-                for optics, panel in seen
-            ]
-            lights, glow_e = [light for light, _ in parts], glow_e * parts[0][1]
+            optics_and_panels = zip((self.true_optics, self.sky_optics), panels, strict=False)
+            parts = []
+            for optics, panel in optics_and_panels:
+                parts.append(rolling_light(self.bench, optics.geometry, panel, view, phase_s))
+            lights = [light for light, _ in parts]
+            glow_e = glow_e * parts[0][1]
         else:
             lights = exposure_lights(self.bench, frame, first_frame, panels)
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
-        pixels_e, bayer = self._mosaic.shown(by_primary), self._mosaic.bayer
+        pixels_e = self._mosaic.shown(by_primary)
+        bayer = self._mosaic.bayer
         sky = self._found_in(
             sum(skies[1:], start=skies[0]) if bayer is None else in_pixels(skies, bayer)
         )
@@ -237,12 +246,13 @@ class Twin(Closing):
             )
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
-        discs, under_e = self.bench.discs(view), glow_e + self._background.of_view_e(view)
+        discs = self.bench.discs(view)
+        under_e = glow_e + self._background.of_view_e(view)
         points = ~np.isin(frame.rows["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(
             self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T
         )
-        found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
+        hidden_cones = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
         truth = frame.rows[points]
         if bayer is not None and self.bench.stars.colours is not None:
             of_channels = shares_at(self.bench.stars.colours, self.bench.stars, frame.star[points])
@@ -250,7 +260,7 @@ class Twin(Closing):
                 bayer.count(channel) / len(bayer) for channel in CHANNELS
             ]
         return TwinField(
-            shown, assumed, sky, truth, x_px, y_px, pixels_e, found, under_e, by_channel
+            shown, assumed, sky, truth, x_px, y_px, pixels_e, hidden_cones, under_e, by_channel
         )
 
     def _found_in(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -274,10 +284,8 @@ class Twin(Closing):
         A frame transfer's smear is in these alone: in images without noise, sky and display would
         have the same.
         """
-        exposure_s, under_e = (
-            self.config.tracker.exposure_s,
-            np.broadcast_to(seen.under_e, seen.pixels_e.shape),
-        )
+        exposure_s = self.config.tracker.exposure_s
+        under_e = np.broadcast_to(seen.under_e, seen.pixels_e.shape)
         dn = self.detector.expose(seen.pixels_e + under_e, exposure_s, rng)
         collected_e = self.detector.collected_e(under_e, exposure_s)
         alike = collected_e.min() == collected_e.max()
@@ -313,7 +321,9 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
     cannot be used.
     """
     config = bench.config
-    verify, collimator, monitor = config.verify, config.collimator, config.monitor
+    verify = config.verify
+    collimator = config.collimator
+    monitor = config.monitor
     if verify.true_geometry is not None:
         camera = real_monitor(config, bench.file.folder, verify.true_geometry)
         return BenchGeometry(camera, tracker, verify.true_mirror)

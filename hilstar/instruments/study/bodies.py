@@ -174,13 +174,12 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
         (Path(folder) / "low.tle").write_text(TLE)
         benches = {}
         for name in names:
-            own = {
-                key: table
-                for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True)
-                if table
-            }
+            own_tables = {}
+            for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True):
+                if table:
+                    own_tables[key] = table
             path = Path(folder) / f"{name.replace(' ', '_')}.toml"
-            benches[name] = stack.enter_context(study_bench(path, {**common, **own}))
+            benches[name] = stack.enter_context(study_bench(path, {**common, **own_tables}))
         yield benches
 
 
@@ -195,9 +194,10 @@ def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
     )
     off_rad = np.radians(off_deg) + (disc.radius_rad if body == "Earth" else 0.0)
     # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
-    beside = (
-        disc.sun if body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
-    )
+    if body == "Earth":
+        beside = disc.sun
+    else:
+        beside = np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
     beside = beside - (beside @ disc.direction) * disc.direction
     beside /= np.linalg.norm(beside)
     x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * beside
@@ -267,7 +267,8 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
     """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all"
     and the scene's.
     """
-    bench, nothing = benches[scene.bench], benches["nothing"]
+    bench = benches[scene.bench]
+    nothing = benches["nothing"]
     knows = bench.moving is not None and scene.body in bench.moving.names
     q = attitude(bench if knows else benches["all"], scene.body, scene.off_deg, scene.t_ns)
     without, shown = fastest((nothing, bench), q, scene.t_ns, scene.step_ns, rounds)
@@ -345,7 +346,8 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
 
     disc = moon(radius_px, phase_deg)
     half = int(np.ceil(radius_px)) + MARGIN_PX
-    size, psf = (2 * half + 1, 2 * half + 1), GaussianPsf(SIGMA_PX)
+    size = (2 * half + 1, 2 * half + 1)
+    psf = GaussianPsf(SIGMA_PX)
     camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
     with Renderer(Target(size, psf)) as renderer:
         place = camera.project(disc.direction[None])
@@ -425,7 +427,8 @@ def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
     below = profile < level
     first = np.maximum(np.argmax(below, axis=1), 1)
     rows = np.arange(PLACES)
-    high, low = profile[rows, first - 1], profile[rows, first]
+    high = profile[rows, first - 1]
+    low = profile[rows, first]
     place = steps[first - 1] + (steps[1] - steps[0]) * (high - level[:, 0]) / (high - low)
     return np.asarray(np.where(below.any(axis=1), place, np.nan))
 
@@ -453,14 +456,16 @@ class Near:
 
 def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: int) -> Near:
     """A body at one place. `benches` has "nothing" and the body's own."""
-    bench, nothing = benches[body], benches["nothing"]
+    bench = benches[body]
+    nothing = benches["nothing"]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
     q = attitude(bench, body, off_deg, start_ns)
     without, shown = fastest((nothing, bench), q, start_ns, FRAME_NS, rounds)
     drawn = bench.draw(q, t_ns=start_ns)
     levels = drawn.levels.copy()
     light = bench.renderer.linear()
-    brightest, white = float(light.max()), bench.flux_at_white_e_per_s
+    brightest = float(light.max())
+    white = bench.flux_at_white_e_per_s
     return Near(
         body=body,
         off_deg=off_deg,

@@ -107,7 +107,9 @@ WAYS = (
 def response_of(bits: int, way: Way) -> Response:
     """The sRGB response of a way; with bit stealing, of three equal channels."""
     grey = srgb_response(bits)
-    return bit_stealing_response((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
+    if way.stealing:
+        return bit_stealing_response((grey, grey, grey), STEALING_WEIGHTS)
+    return grey
 
 
 def star_field(frame_px: tuple[int, int], footprint_px: int) -> FrameLight:
@@ -137,11 +139,13 @@ def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list
     """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the
     tracker is as usual.
     """
-    panel, balance = Panel(response_of(bits, way), WHITE), Balance(USUAL_PSF, AS_USUAL)
+    panel = Panel(response_of(bits, way), WHITE)
+    balance = Balance(USUAL_PSF, AS_USUAL)
     sprites, _, bright, judge = judged_phases(phases)
     errors = []
     for mag in mags:
-        wanted, share = fainter(sprites, mag), flux_ratio(mag)
+        wanted = fainter(sprites, mag)
+        share = flux_ratio(mag)
         kind = QUANTISERS[way.method]
         shown = shown_by(
             kind, way.frames, panel, (bright * share).astype(np.float32), wanted, balance
@@ -198,22 +202,24 @@ def study_frames(directory: Path, quick: bool) -> str:
         ("linear, 2 bits", equal[2], 2.0),
         ("1 bit", equal[1], 2.0),
     )
-    left = [row for panel in shown for row in _left_by(*panel, phases, counts)]
-    write_records(directory / "over_frames.csv", left)
-    draw(directory / "over_frames", left)
-    at = (row for row in left if (row.frames, row.method) == (AIM_FRAMES, "temporal"))
-    each = "; ".join(
+    residual_rows = [row for panel in shown for row in _left_by(*panel, phases, counts)]
+    write_records(directory / "over_frames.csv", residual_rows)
+    draw(directory / "over_frames", residual_rows)
+    at = (row for row in residual_rows if (row.frames, row.method) == (AIM_FRAMES, "temporal"))
+    row_text = "; ".join(
         f"{row.panel} {row.flux_rms_mag:.2g} mag, {row.axis_rms_px_fit:.2g} px" for row in at
     )
-    return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {each}"
+    return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {row_text}"
 
 
 def _left_by(
     name: str, response: Response, mag: float, phases: int, counts: tuple[int, ...]
 ) -> Iterator[OverFrames]:
-    panel, share = Panel(response, WHITE), flux_ratio(mag)
+    panel = Panel(response, WHITE)
+    share = flux_ratio(mag)
     sprites, tile, bright, judge = judged_phases(phases)
-    stars, linear = fainter(sprites, mag), (share * bright).astype(np.float32)
+    stars = fainter(sprites, mag)
+    linear = (share * bright).astype(np.float32)
     quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), USUAL_PSF)
     steps = float(stars.data["electrons_per_s"][0]) / (float(response.light[1]) * WHITE)
     kinds: tuple[Centroider, ...] = ("moment", "window", "fit")
@@ -221,24 +227,27 @@ def _left_by(
         # light up to the end of each frame
         whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))
         for frame in range(len(whole) - 1):
-            levels = (
-                quantiser.levels(stars)
-                if method == "temporal"
-                else dither_levels(linear, panel, mask_turn(frame))
-            )
+            if method == "temporal":
+                levels = quantiser.levels(stars)
+            else:
+                levels = dither_levels(linear, panel, mask_turn(frame))
             whole[frame + 1] = whole[frame] + shown_light(levels, panel)
 
         def until(refreshes: float, whole: FloatArray = whole) -> FloatArray:
-            frame, part = int(refreshes), refreshes % 1
+            frame = int(refreshes)
+            part = refreshes % 1
             return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
 
         for count in counts:
-            errors = [
-                judge.errors((until(begin + count) - until(begin)) / count, share, kinds)
-                for begin in BEGINS
+            errors = []
+            for begin in BEGINS:
+                errors.append(
+                    judge.errors((until(begin + count) - until(begin)) / count, share, kinds)
+                )
+            error_rows = [
+                (e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors
             ]
-            each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors]
-            rms = np.sqrt(np.mean(np.square(each), axis=0)).tolist()
+            rms = np.sqrt(np.mean(np.square(error_rows), axis=0)).tolist()
             yield OverFrames(name, mag, steps, method, count, *rms)
 
 

@@ -146,17 +146,17 @@ def curve_of(lobes: Lobes) -> FloatArray:
 def write_spectra(folder: Path) -> None:
     """Primaries and quantum efficiencies as the files that benches name."""
     for name, three in PANELS.items():
-        rows = [
-            ",".join(f"{x:.6g}" for x in row) for row in zip(NM, *map(curve_of, three), strict=True)
-        ]
+        rows = []
+        for row in zip(NM, *map(curve_of, three), strict=True):
+            rows.append(",".join(f"{x:.6g}" for x in row))
         (folder / f"{name}.csv").write_text("\n".join(["wavelength_nm,r,g,b", *rows]))
     for name, three in SENSORS.items():
-        for one, lobes in zip(CHANNELS, three, strict=True):
+        for channel, lobes in zip(CHANNELS, three, strict=True):
             lines = [
                 "wavelength_nm,value",
                 *(f"{nm:g},{value:.6g}" for nm, value in zip(NM, curve_of(lobes), strict=True)),
             ]
-            (folder / f"{name} {one}.csv").write_text("\n".join(lines))
+            (folder / f"{name} {channel}.csv").write_text("\n".join(lines))
     whole = load_curve(MONO_SENSOR, "quantum_efficiency")
     cut = (
         f"{nm:g},{value:.6g}"
@@ -171,11 +171,14 @@ def file_of(
     folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, **render: str | float
 ) -> BenchFile:
     """The bench of a panel with vertical stripes and a sensor, in the folder of the spectra."""
-    three = {f"quantum_efficiency_{one}": f"{sensor} {one}.csv" for one in CHANNELS}
-    own = {"quantum_efficiency": MONO[sensor]} if sensor in MONO else three
+    three = {f"quantum_efficiency_{letter}": f"{sensor} {letter}.csv" for letter in CHANNELS}
+    if sensor in MONO:
+        efficiency_keys = {"quantum_efficiency": MONO[sensor]}
+    else:
+        efficiency_keys = three
     text = bench_text(
         {
-            "tracker": {**own, "transmission": GLASS, "resolution_px": (1024, 1024)},
+            "tracker": {**efficiency_keys, "transmission": GLASS, "resolution_px": (1024, 1024)},
             "tracker.detector": {} if sensor in MONO else {"bayer": "rggb"},
             "sky": {"faintest_v_mag": faintest_v_mag},
             "monitor": {"resolution_px": FRAME_PX, "pixel_pitch_um": 57.65},
@@ -199,13 +202,20 @@ def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatA
     """
     library = load_library()
     kinds = read_types(np.array(library.spectral_type, dtype=np.bytes_))
-    order, nm = np.flatnonzero(kinds[:, 1] == CLASSES["V"]), library.wavelength_nm
+    order = np.flatnonzero(kinds[:, 1] == CLASSES["V"])
+    nm = library.wavelength_nm
     order = order[np.argsort(kinds[order, 0])]
-    seen = np.array(
-        [one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()]
+    response_nm = np.array(
+        [
+            channel.quantum_efficiency(nm) * channel.transmission(nm) * nm
+            for channel in channels.values()
+        ]
     )
-    light = library.flux[order] @ seen.T
-    colour = light if len(seen) > 1 else library.flux[order] @ (seen * nm).T / light
+    light = library.flux[order] @ response_nm.T
+    if len(response_nm) > 1:
+        colour = light
+    else:
+        colour = library.flux[order] @ (response_nm * nm).T / light
     index = np.maximum.accumulate(-warmth(colour))
     return lambda wanted: np.asarray(np.interp(-warmth(wanted), index, kinds[order, 0]))
 
@@ -223,24 +233,26 @@ def study_gamut(folder: Path, by_class: list[Row]) -> Iterator[Row]:
     for panel, sensor in product(PANELS, (*MONO, *SENSORS)):
         file = file_of(folder, panel, sensor)
         stars = bench_stars(file.config, folder)
-        colours, subtypes = (
-            colours_of(file, stars),
-            subtypes_by(named_channels(file.config.tracker, folder)),
-        )
+        colours = colours_of(file, stars)
+        subtypes = subtypes_by(named_channels(file.config.tracker, folder))
         wanted = colours.wanted(stars)
-        shares, own = colours.shares(wanted), subtypes(wanted[:, : 1 if colours.mono else 3])
-        off, warmer = (
-            colours.off(wanted, shares),
-            np.abs(colours.temperature_factor(wanted, shares) - 1).mean(),
-        )
+        shares = colours.shares(wanted)
+        own_subtypes = subtypes(wanted[:, : 1 if colours.mono else 3])
+        off = colours.off(wanted, shares)
+        warmer = np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
         by_star, by_white = (
-            np.abs(subtypes(colours.shown(one)) - own) for one in (shares, colours.of_white[None])
+            np.abs(subtypes(colours.shown(mixture)) - own_subtypes)
+            for mixture in (shares, colours.of_white[None])
         )
-        out, condition = (~colours.in_gamut(off)).mean(), colours.matrix.condition or math.nan
-        at_off, kinds = np.percentile(off, (50, 95)), np.floor(star_types(stars.catalog)[:, 0] / 10)
+        out = (~colours.in_gamut(off)).mean()
+        condition = colours.matrix.condition or math.nan
+        at_off = np.percentile(off, (50, 95))
+        kinds = np.floor(star_types(stars.catalog)[:, 0] / 10)
         for number, letter in enumerate(LETTERS if colours.mono else ""):
             some = np.flatnonzero(kinds[stars.row] == number)
-            figures = (float(one[some].mean()) for one in (wanted[:, 0], off, by_star, by_white))
+            figures = (
+                float(mixture[some].mean()) for mixture in (wanted[:, 0], off, by_star, by_white)
+            )
             by_class.append((panel, sensor, letter, len(some), *figures))
         yield (
             panel,
@@ -316,11 +328,9 @@ def study_choices(
                 )
                 for key in product(INKS, ("round", "exact"))
             }
-            own = benches["star", "exact"]
-            colours, subtypes = (
-                colours_of(own.file, own.stars),
-                subtypes_by(named_channels(own.config.tracker, folder)),
-            )
+            chosen_bench = benches["star", "exact"]
+            colours = colours_of(chosen_bench.file, chosen_bench.stars)
+            subtypes = subtypes_by(named_channels(chosen_bench.config.tracker, folder))
             times = in_turn(
                 {" ".join(key): partial(frame_of, bench) for key, bench in benches.items()}, rounds
             )
@@ -330,11 +340,16 @@ def study_choices(
                 shown = colours.shown(shares)
                 # what all are off by is the alignment's
                 off = np.hypot(*(off - np.median(off, axis=0)).T)
-                flux_mag = np.abs([magnitude(float(one)) for one in flux[:, 0]])
-                channels = np.abs(flux - 1) if colours.mono else np.abs(shown / wanted - 1)
+                flux_mag = np.abs([magnitude(float(star_flux)) for star_flux in flux[:, 0]])
+                if colours.mono:
+                    channels = np.abs(flux - 1)
+                else:
+                    channels = np.abs(shown / wanted - 1)
                 off_kind = np.abs(subtypes(shown) - subtypes(wanted[:, : shown.shape[1]])).mean()
                 off_k = 100 * np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
-                at_95 = (np.percentile(one, 95) for one in (flux_mag, 100 * channels, off))
+                at_95 = (
+                    np.percentile(star_flux, 95) for star_flux in (flux_mag, 100 * channels, off)
+                )
                 figures = (*np.min(times[" ".join(key)], axis=0), off_kind, off_k, *at_95)
                 yield (tracker, *key, len(flux), *map(float, figures))
 
@@ -360,35 +375,41 @@ def study_lateral(folder: Path) -> Iterator[Row]:
         except InputError:
             continue
         by_primary = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
-        own, wanted = (
-            StarGlass(file, psf).shares(stars, np.arange(len(stars))),
-            colours.wanted(stars),
-        )
+        own_shares = StarGlass(file, psf).shares(stars, np.arange(len(stars)))
+        wanted = colours.wanted(stars)
         solar = int(np.abs(stars.bv_mag - SOLAR_BV).argmin())
         places = (
             np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
         )
         # as for a lens that is not known
-        white, plain = colours.of_white + 0 * wanted[:, :1], replace(colours, lateral=None)
+        white = colours.of_white + 0 * wanted[:, :1]
+        plain = replace(colours, lateral=None)
         for colour, known, unknown in (
             ("white", white, white),
             ("star", colours.shares(wanted), plain.shares(wanted)),
         ):
-            glass = [moved_px(psf, places, one, solar) for one in (own, known @ by_primary)]
-            means = [(one - one[solar]).T / 100 for one in (wanted[:, :1], plain.shown(unknown))]
+            glass = [
+                moved_px(psf, places, spectrum_shares, solar)
+                for spectrum_shares in (own_shares, known @ by_primary)
+            ]
+            means = [
+                (spectrum_shares - spectrum_shares[solar]).T / 100
+                for spectrum_shares in (wanted[:, :1], plain.shown(unknown))
+            ]
             for lens, (sky, shown) in (("planar-1897", glass), ("linear", means)):
                 sky_px, off_px = (
-                    float(np.sqrt((one**2).sum(axis=0).mean())) for one in (sky, shown - sky)
+                    float(np.sqrt((spectrum_shares**2).sum(axis=0).mean()))
+                    for spectrum_shares in (sky, shown - sky)
                 )
                 yield lens, panel, colour, sky_px, off_px, off_px / sky_px
 
 
 def moved_px(psf: Psf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
     """By how much spectra (n, L) move stars at places (2, n), px, against one of them there."""
-    found = [
-        psf.centroids_px(places_px[0], places_px[1], one)[:2] for one in (spectra, spectra[against])
-    ]
-    return np.asarray(np.stack(found[0]) - np.stack(found[1]))
+    centroids = []
+    for spectrum_shares in (spectra, spectra[against]):
+        centroids.append(psf.centroids_px(places_px[0], places_px[1], spectrum_shares)[:2])
+    return np.asarray(np.stack(centroids[0]) - np.stack(centroids[1]))
 
 
 def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
@@ -397,7 +418,7 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
     y_px, x_px = (TILE_PX // 2 + grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
     at = np.arange(TILE_PX)
     for sigma_px, kelvin in product(SIGMAS_PX, STARS_K):
-        rates = [float(dgs_electrons_per_s(kelvin, one, Photometry())) for one in channels]
+        rates = [float(dgs_electrons_per_s(kelvin, channel, Photometry())) for channel in channels]
         shares = GaussianPsf((sigma_px, sigma_px)).shares(
             (at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None]
         )
@@ -431,11 +452,12 @@ def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
     """The chart of the choices; its finding."""
     choices = [dict(zip(CHOICE, row, strict=True)) for row in rows]
     exact = {
-        one["colour"]: one
-        for one in choices
-        if (one["tracker"], one["method"]) == ("Bayer", "exact")
+        choice["colour"]: choice
+        for choice in choices
+        if (choice["tracker"], choice["method"]) == ("Bayer", "exact")
     }
-    star, white = exact["star"], exact["white"]
+    star = exact["star"]
+    white = exact["white"]
     finding = (
         f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker,"
         f" white {white['subtypes']:.0f}"
@@ -452,10 +474,13 @@ def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
     }
     with chart(path, finding, 3, note=load.note(note)) as axes:
         for axis, (name, label) in zip(axes, labels.items(), strict=True):
-            for one in choices:
-                ink, marker = INKS[str(one["colour"])], MARKERS[str(one["tracker"])]
-                face = ink if one["method"] == "exact" else "none"
-                axis.loglog(one["cpu_ms"], one[name], marker, ms=7, color=ink, markerfacecolor=face)
+            for choice in choices:
+                ink = INKS[str(choice["colour"])]
+                marker = MARKERS[str(choice["tracker"])]
+                face = ink if choice["method"] == "exact" else "none"
+                axis.loglog(
+                    choice["cpu_ms"], choice[name], marker, ms=7, color=ink, markerfacecolor=face
+                )
             axis.set_ylabel(label)
         for name, ink in INKS.items():
             axes[0].plot([], [], "o", color=ink, label=name)
@@ -479,19 +504,20 @@ def run(directory: Path, quick: bool = False) -> Judged:
         folder = Path(name)
         write_spectra(folder)
         by_class: list[Row] = []
-        gamut, lateral = list(study_gamut(folder, by_class)), list(study_lateral(folder))
+        gamut = list(study_gamut(folder, by_class))
+        lateral = list(study_lateral(folder))
         before = dict([*TRACKERS.items()][: 2 if quick else None])
         choices = list(
             study_choices(
                 folder, before, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))
             )
         )
-        trackers = {
-            sensor: file_of(folder, "OLED", sensor).config.tracker for sensor in (*MONO, *SENSORS)
-        }
+        trackers = {}
+        for sensor in (*MONO, *SENSORS):
+            trackers[sensor] = file_of(folder, "OLED", sensor).config.tracker
         red = [
-            (name, *class_shares(bench_optics(one, folder), RED_NM).values())
-            for name, one in trackers.items()
+            (name, *class_shares(bench_optics(tracker_name, folder), RED_NM).values())
+            for name, tracker_name in trackers.items()
         ]
         mosaic = list(study_mosaic(bench_channels(trackers["Bayer, wide dyes"], folder)))
     three = (

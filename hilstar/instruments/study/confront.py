@@ -53,12 +53,12 @@ def run(directory: Path, images: Path, quick: bool = False) -> list[str]:
     )
     if not cameras:
         raise InputError(f"{images}: has no guess.toml; give {FORM}")
-    found = [
+    camera_rows = [
         row for folder in cameras for row in confront_camera(folder, directory / folder.name, quick)
     ]
-    write_records(directory / "confront.csv", found)
-    draw(directory / "confront", found)
-    return [line_of(row) for row in found]
+    write_records(directory / "confront.csv", camera_rows)
+    draw(directory / "confront", camera_rows)
+    return [line_of(row) for row in camera_rows]
 
 
 def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographFound]:
@@ -67,7 +67,8 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographF
     if not paths:
         raise InputError(f"{folder}: has no image; give {FORM}")
     make_directory(output)
-    refused, fitted = [], None
+    refused = []
+    fitted = None
     while paths and fitted is None:
         try:
             fitted = confront(folder / "guess.toml", paths, output)
@@ -82,8 +83,8 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographF
             )
             why = re.sub(r"\S*/", "", str(error)).split(": ", 1)[-1]
             refused += [
-                PhotographFound(folder.name, one.name, refused=why)
-                for one in ([wrong] if wrong else paths)
+                PhotographFound(folder.name, image_path.name, refused=why)
+                for image_path in ([wrong] if wrong else paths)
             ]
             paths = [path for path in paths if wrong is not None and path != wrong]
     if fitted is None:
@@ -97,7 +98,8 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographF
 
 def row_of(camera: str, found: Confronted, number: int) -> PhotographFound:
     """The figures of one image of a confrontation."""
-    verdict, session = found.verdicts[number], found.session
+    verdict = found.verdicts[number]
+    session = found.session
     return PhotographFound(
         camera=camera,
         image=verdict.shot.photo.name,
@@ -116,13 +118,14 @@ def held_out(
     row: PhotographFound, folder: Path, output: Path, paths: Sequence[Path]
 ) -> PhotographFound:
     """The row with what a camera of the other images leaves of this one."""
-    own = next(path for path in paths if path.name == row.image)
-    others, test = output / "held_out" / own.stem / "fit", output / "held_out" / own.stem / "test"
+    own_path = next(path for path in paths if path.name == row.image)
+    others = output / "held_out" / own_path.stem / "fit"
+    test = output / "held_out" / own_path.stem / "test"
     for place in (output / "held_out", others.parent, others, test):
         make_directory(place)
     try:
-        confront(folder / "guess.toml", [path for path in paths if path != own], others)
-        verdict = confront(others / "tracker.toml", [own], test, fixed=True).verdicts[0]
+        confront(folder / "guess.toml", [path for path in paths if path != own_path], others)
+        verdict = confront(others / "tracker.toml", [own_path], test, fixed=True).verdicts[0]
     except InputError:  # too few stars without it: nothing is held out
         return row
     return replace(row, held_out_px=verdict.rms_px, held_out_mag=verdict.rms_mag)
@@ -138,21 +141,18 @@ def line_of(row: PhotographFound) -> str:
         f" mag, background chi2 {row.background_chi2:.2f}, {row.unexplained} of {row.sources}"
         f" sources unexplained, DN go as light to the power {row.linearity:.2f}"
     )
-    return (
-        line
-        if math.isnan(row.held_out_px)
-        else f"{line}; held out {row.held_out_px:.3f} px, {row.held_out_mag:.3f} mag"
-    )
+    if math.isnan(row.held_out_px):
+        return line
+    return f"{line}; held out {row.held_out_px:.3f} px, {row.held_out_mag:.3f} mag"
 
 
 def short_name(row: PhotographFound, rows: Sequence[PhotographFound]) -> str:
     """The words of an image's name that not all images of its camera share, whole."""
     words = Path(row.image).stem.split("_")
-    others = [
-        set(Path(other.image).stem.split("_"))
-        for other in rows
-        if other.camera == row.camera and other.image != row.image
-    ]
+    others = []
+    for other in rows:
+        if other.camera == row.camera and other.image != row.image:
+            others.append(set(Path(other.image).stem.split("_")))
     if not others:
         return " ".join(words)
     shared = set.intersection(*others)
@@ -166,7 +166,8 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
     rows = [row for row in found if not row.refused]
     if not rows:
         return
-    best, worst = min(row.rms_px for row in rows), max(row.rms_px for row in rows)
+    best = min(row.rms_px for row in rows)
+    worst = max(row.rms_px for row in rows)
     of = f"{len(rows)} photograph{'s' * (len(rows) > 1)}"
     finding = f"{of}: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
     note = (

@@ -146,8 +146,10 @@ def run(directory: Path, quick: bool = False) -> Judged:
     """Measure every scene, and write `economy.csv` and its chart; a line for each comparison.
     Raises InputError.
     """
-    others, rounds = OtherWork(), QUICK_ROUNDS if quick else ROUNDS
-    comparisons, rows = [], []
+    others = OtherWork()
+    rounds = QUICK_ROUNDS if quick else ROUNDS
+    comparisons = []
+    rows = []
     for bits in BITS:
         for scene in SCENES:
             full, *autos = compare(scene, bits, rounds)
@@ -195,25 +197,29 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
 
 
 def _outcome(scene: EffortScene, name: str, bench: Bench, times: list[Spent]) -> EffortOutcome:
-    tolerance = next((one for one in TOLERANCES if one.name == name), DEFAULT)
-    turn, size = scene.turn, bench.camera.resolution_px
+    tolerance = next(
+        (known_tolerance for known_tolerance in TOLERANCES if known_tolerance.name == name), DEFAULT
+    )
+    turn = scene.turn
+    size = bench.camera.resolution_px
     drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
     shown = shown_light(drawn.levels, bench.panel)
     scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
     sprites = swept_sprites(bench.stars, turn, scan, bench.camera, bench.psf)
     true = linear_image(sprites, size, bench.psf)
-    errors, windows = [], []
+    errors = []
+    windows = []
     rates = sprites.data["electrons_per_s"]
     for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size, ISOLATION):
         if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
             continue  # clips at some sub-pixel phases
         errors.append(star_error(shown, true, window))
         windows.append(window)
-    seen = bench.renderer.target.seen
+    seen_optics = bench.renderer.target.seen
     lit, wanted = (squares(image, windows) for image in (shown, true))
     width_px = bench.psf.width_px
     off_px = stamp_errors(
-        lit, wanted, width_px, seen.blur_px, seen.pixel_px, box_share=NO_THRESHOLD
+        lit, wanted, width_px, seen_optics.blur_px, seen_optics.pixel_px, box_share=NO_THRESHOLD
     )
     return EffortOutcome(
         scene=scene.name,
@@ -223,8 +229,8 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, times: list[Spent]) ->
         tolerance_px=tolerance.px,
         quantisation=bench.config.render.quantisation,
         stars=drawn.star_count,
-        frame_ms=float(np.median([one.wall_ms for one in times])),
-        cpu_ms=float(np.median([one.cpu_ms for one in times])),
+        frame_ms=float(np.median([known_tolerance.wall_ms for known_tolerance in times])),
+        cpu_ms=float(np.median([known_tolerance.cpu_ms for known_tolerance in times])),
         claimed_mag=bench.effort.error_mag,
         claimed_px=bench.effort.error_px,
         claimed_within=bench.effort.within,
@@ -236,8 +242,13 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, times: list[Spent]) ->
 
 
 def _line(comparison: EffortComparison, load: Load) -> str:
-    full, auto, ratio = comparison.full, comparison.auto, comparison.speed_up
-    compared = f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
+    full = comparison.full
+    auto = comparison.auto
+    ratio = comparison.speed_up
+    if ratio >= 1:
+        compared = f"{ratio:.1f} times as fast"
+    else:
+        compared = f"{1 / ratio:.1f} times as SLOW"
     if load.busy:
         compared = NOT_JUDGED
     return (
@@ -280,32 +291,44 @@ def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
         "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have"
         " no threshold. Tolerances: "
     )
-    note += "; ".join(f"{one.name}, {one.mag:g} mag and {one.px:g} px" for one in TOLERANCES) + "."
+    note += (
+        "; ".join(
+            f"{known_tolerance.name}, {known_tolerance.mag:g} mag and {known_tolerance.px:g} px"
+            for known_tolerance in TOLERANCES
+        )
+        + "."
+    )
     title = load.title(economy_finding(comparisons), f"Auto effort is {within_words(comparisons)}")
     kinds = [(bits, tolerance) for bits in BITS for tolerance in TOLERANCES]
     width = 0.84 / len(kinds)
     with chart(path, title, panels=2, note=load.note(note), heights=(1, 1)) as (speed, error):
-        scenes = list(dict.fromkeys(one.auto.scene for one in comparisons))
+        scenes = list(dict.fromkeys(known_tolerance.auto.scene for known_tolerance in comparisons))
         at = np.arange(len(scenes))
         for place, (bits, tolerance) in enumerate(kinds):
             mine = [
-                one
-                for one in comparisons
-                if (one.auto.bits, one.auto.tolerance) == (bits, tolerance.name)
+                known_tolerance
+                for known_tolerance in comparisons
+                if (known_tolerance.auto.bits, known_tolerance.auto.tolerance)
+                == (bits, tolerance.name)
             ]
-            colour, alpha = COLOURS[bits], 1.0 if tolerance is DEFAULT else 0.5
+            colour = COLOURS[bits]
+            alpha = 1.0 if tolerance is DEFAULT else 0.5
             label = f"{bits} bits, {tolerance.name}"
             shift = (place - (len(kinds) - 1) / 2) * width
             speed.bar(
                 at + shift,
-                [one.speed_up for one in mine],
+                [known_tolerance.speed_up for known_tolerance in mine],
                 width,
                 label=label,
                 color=colour,
                 alpha=alpha,
             )
             error.bar(
-                at + shift, [one.auto.share for one in mine], width, color=colour, alpha=alpha
+                at + shift,
+                [known_tolerance.auto.share for known_tolerance in mine],
+                width,
+                color=colour,
+                alpha=alpha,
             )
         for axes, name in ((speed, "as fast as full effort"), (error, "tolerance")):
             axes.axhline(1.0, color=RED, linewidth=1, label=name)

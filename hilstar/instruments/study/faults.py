@@ -165,8 +165,8 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
             return bench.renderer.levels()
         if effects.blank:
             return bench.draw_sprites(None).levels
-        seen = effects.turned(bench.view(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)))
-        return bench.draw_sprites(bench.light(seen, effects if effects.now else None)).levels
+        turned_view = effects.turned(bench.view(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)))
+        return bench.draw_sprites(bench.light(turned_view, effects if effects.now else None)).levels
 
     ms = medians_ms({"without": plain, "with": faulty}, rounds)
     return FaultCost(
@@ -188,8 +188,10 @@ def stray_light(bench: Bench, share: float) -> Stray:
     glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)
     lights = (glow,) if share else ()
     both, alone = (
-        shown_light(bench.draw_sprites(replace(each, extended=lights)).levels, bench.panel).copy()
-        for each in (sprites, join_sprites([], sprites.footprint_px))
+        shown_light(
+            bench.draw_sprites(replace(sprite_set, extended=lights)).levels, bench.panel
+        ).copy()
+        for sprite_set in (sprites, join_sprites([], sprites.footprint_px))
     )
     off_mag = []
     for star, window in lone_windows(
@@ -199,15 +201,15 @@ def stray_light(bench: Bench, share: float) -> Stray:
         got = float((both[window] - alone[window]).sum())
         off_mag.append(magnitude(got / wanted) if got > 0 else np.inf)
     errors = np.abs(np.array(off_mag))
-    kept = np.where(np.isfinite(errors), errors, 99.0)
-    median, p95 = np.percentile(kept, (50, 95)).tolist()
+    finite_errors = np.where(np.isfinite(errors), errors, 99.0)
+    median, p95 = np.percentile(finite_errors, (50, 95)).tolist()
     return Stray(
         bench.config.render.quantisation,
         share,
-        len(kept),
+        len(finite_errors),
         median,
         p95,
-        float((kept > LOST_MAG).mean()),
+        float((finite_errors > LOST_MAG).mean()),
     )
 
 
@@ -230,27 +232,28 @@ def run(directory: Path, quick: bool = False) -> Judged:
     write_records(directory / "faults-stray.csv", strays)
     draw_stray(directory / "faults", strays)
     draw_costs(directory / "faults_cost", costs, load)
-    found = []
+    findings = []
     for quantisation in QUANTISATIONS:
         mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
-        off, star, dearest = (
-            mine[NOWHERE],
-            mine["false star, on the sky"],
-            max(mine.values(), key=lambda cost: cost.cost_ms),
-        )
-        found.append(
+        off = mine[NOWHERE]
+        star = mine["false star, on the sky"]
+        dearest = max(mine.values(), key=lambda cost: cost.cost_ms)
+        findings.append(
             f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on"
             f" takes {off.cost_ms:+.2f} ms, a false star {star.cost_ms:+.2f} ms; the dearest,"
             f" {dearest.case}, {dearest.cost_ms:+.1f} ms"
         )
     for quantisation in QUANTISATIONS:
         share = spoilt_from(strays, quantisation)
-        limit = "no stray light here" if share is None else f"stray light of {share:g} of white"
-        found.append(
+        if share is None:
+            limit = "no stray light here"
+        else:
+            limit = f"stray light of {share:g} of white"
+        findings.append(
             f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from"
             f" {limit} on"
         )
-    return load.judged(found)
+    return load.judged(findings)
 
 
 def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
@@ -268,16 +271,17 @@ def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
 def draw_stray(path: Path, strays: list[Stray]) -> None:
     """The error of stars under even stray light."""
     shares = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
-    said = [
+    share_texts = [
         f"from {share:g} of white on with {name}"
         for name, share in shares.items()
         if share is not None
     ]
-    finding = (
-        f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(said)}"
-        if said
-        else "No stray light spoils stars"
-    )
+    if share_texts:
+        finding = (
+            f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(share_texts)}"
+        )
+    else:
+        finding = "No stray light spoils stars"
     looks = {name: SeriesLook(name, colour, "o") for name, colour in COLOURS.items()}
     spec = ChartSpec((STRAY_PANEL,), lambda row: row.quantisation, looks, STRAY_NOTE)
     draw_rows(path, finding, spec, [row for row in strays if row.share_of_white])
@@ -295,7 +299,8 @@ def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:
         "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run."
         " Medians; 1920 x 1080."
     )
-    title, note = load.title(finding, "Times of frames with each fault"), load.note(note)
+    title = load.title(finding, "Times of frames with each fault")
+    note = load.note(note)
     with chart(
         path, title, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2
     ) as panels:

@@ -145,10 +145,8 @@ class TracedBench:
         ):
             at, ray = _refracted(at, ray, radius * scale, before / after)
             at = at - np.array([0.0, 0.0, step * scale])
-        at, ray = (
-            (at + np.array([0.0, 0.0, sum(THICKNESS_MM) * scale])) @ axes.T + vertex,
-            ray @ axes.T,
-        )
+        at = (at + np.array([0.0, 0.0, sum(THICKNESS_MM) * scale])) @ axes.T + vertex
+        ray = ray @ axes.T
         screen = turned(*self.screen_tilt_deg)
         middle = np.array(
             [*self.screen_shift_mm, self.to_lens_mm + (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale]
@@ -164,14 +162,21 @@ class TracedBench:
         """
         u = (np.asarray(x_px) - (self.resolution_px[0] - 1) / 2) * self.pitch_mm / self.focal_mm
         v = (np.asarray(y_px) - (self.resolution_px[1] - 1) / 2) * self.pitch_mm / self.focal_mm
-        ones, step = np.ones_like(u), 1e-6
+        ones = np.ones_like(u)
+        step = 1e-6
         for _ in range(12):
             x, y = self.places_px(np.column_stack([u, v, ones]))
             xu, yu = self.places_px(np.column_stack([u + step, v, ones]))
             xv, yv = self.places_px(np.column_stack([u, v + step, ones]))
-            a, b, c, d = (xu - x) / step, (xv - x) / step, (yu - y) / step, (yv - y) / step
-            area, off_x, off_y = a * d - b * c, x - x_px, y - y_px
-            u, v = u - (d * off_x - b * off_y) / area, v - (a * off_y - c * off_x) / area
+            a = (xu - x) / step
+            b = (xv - x) / step
+            c = (yu - y) / step
+            d = (yv - y) / step
+            area = a * d - b * c
+            off_x = x - x_px
+            off_y = y - y_px
+            u = u - (d * off_x - b * off_y) / area
+            v = v - (a * off_y - c * off_x) / area
         return np.column_stack([u, v, ones]) / np.sqrt(u**2 + v**2 + 1)[:, None]
 
 
@@ -263,7 +268,8 @@ def frames_of(quick: bool) -> list[Frames]:
     sizes: tuple[tuple[int, int], ...] = SIZES
     noises: tuple[float, ...] = NOISES_PX
     if quick:
-        sizes, noises = SIZES[1:4:2], (USUAL_NOISE_PX, NOISES_PX[-1])
+        sizes = SIZES[1:4:2]
+        noises = (USUAL_NOISE_PX, NOISES_PX[-1])
     by_size = {Frames(*size, USUAL_NOISE_PX) for size in sizes}
     by_noise = {Frames(*USUAL_SIZE, noise) for noise in noises}
     return sorted(by_size | by_noise)
@@ -271,7 +277,8 @@ def frames_of(quick: bool) -> list[Frames]:
 
 def line_of(outcome: CalibrationOutcome) -> str:
     """A model's errors in words."""
-    stars_rms, held_out_rms = outcome.stars_rms_arcsec, outcome.held_out_arcsec
+    stars_rms = outcome.stars_rms_arcsec
+    held_out_rms = outcome.held_out_arcsec
     stars = f"stars {stars_rms:.3g} arcsec rms, {outcome.stars_max_arcsec:.3g} maximum"
     line = f"{outcome.model}: {stars}; held-out dots {held_out_rms:.3g} rms"
     if outcome.stars_max_arcsec < FAIL_ARCSEC:
@@ -299,9 +306,9 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
     rng = np.random.default_rng(SEED)
     plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
     x_px, y_px = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
-    seen = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, DotFaults(frames.noise_px), rng)
+    dots = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, DotFaults(frames.noise_px), rng)
     nominal = _nominal()
-    problem, data = matched(plan, nominal, seen, first_look(plan, nominal, seen, rng))
+    problem, data = matched(plan, nominal, dots, first_look(plan, nominal, dots, rng))
     for model in MODELS:
         free = Model(model.parameters)
         held_out_arcsec = held_out(problem, model.name, free, model.field_degree, data).rms_arcsec
@@ -322,7 +329,8 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     """How far stars all over the screen are shown from where the traced rays put them, arcsec."""
     rng = np.random.default_rng(SEED)
     width, height = BENCH.resolution_px
-    x, y = rng.uniform(-0.5, width - 0.5, STARS), rng.uniform(-0.5, height - 0.5, STARS)
+    x = rng.uniform(-0.5, width - 0.5, STARS)
+    y = rng.uniform(-0.5, height - 0.5, STARS)
     monitor = geometry.monitor
     shown_x, shown_y = monitor.project(BENCH.directions(x, y) @ monitor.cam_to_image.T)
     return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)

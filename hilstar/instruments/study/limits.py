@@ -156,7 +156,8 @@ class Limit:
 def narrow_sprites() -> Limit:
     """The place of a star that is integrated over pixels, against its sigma."""
     sigmas_px = np.geomspace(0.9, 0.1, 33)
-    phases, pixels = np.linspace(-0.5, 0.5, 21), np.arange(-8.0, 9.0)
+    phases = np.linspace(-0.5, 0.5, 21)
+    pixels = np.arange(-8.0, 9.0)
     errors = []
     for sigma_px in sigmas_px.tolist():
         shares = np.stack([pixel_shares(pixels - phase, sigma_px) for phase in phases])
@@ -210,7 +211,8 @@ def crowds() -> Limit:
     """The light of stars that have no room in a frame, against the stars in view."""
     counts = np.geomspace(3e3, 3e6, 19)
     room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
-    rng, errors = np.random.default_rng(SEED), []
+    rng = np.random.default_rng(SEED)
+    errors = []
     for count in counts.astype(int).tolist():
         light = flux_ratio(np.log10(rng.uniform(size=count)) / STAR_SLOPE)
         drawn = brightest(light, room)
@@ -227,7 +229,8 @@ def tilted_screen() -> Limit:
     tilts_deg = np.geomspace(0.0003, 3.0, 17)
     errors = []
     for tilt in np.radians(tilts_deg).tolist():
-        across, down = (x_px - camera.principal_point_px[0], y_px - camera.principal_point_px[1])
+        across = x_px - camera.principal_point_px[0]
+        down = y_px - camera.principal_point_px[1]
         depth = camera.focal_length_px + across * math.sin(tilt)
         true = normalise(np.stack([across * math.cos(tilt), down, depth], axis=1))
         turn = turn_between(true, shown, np.ones(len(true)))

@@ -154,7 +154,10 @@ def catalogue_errors(directory: Path) -> ChartFinding:
         for what, count, printed in zip(("V", "B-V"), origins, both, strict=True)
     ]
     for name, (unit, printed) in TABLE_2_3.items():
-        here = facts[name].mean() if name == "sigma_bv_mag" else np.median(facts[name][bright])
+        if name == "sigma_bv_mag":
+            here = facts[name].mean()
+        else:
+            here = np.median(facts[name][bright])
         rows.append((name, unit, float(here), printed))
     write_csv(directory / "catalogue_errors.csv", ("what", "unit", "here", "thesis"), rows)
     medians = {name: here for name, _, here, _ in rows if name in TABLE_2_3}
@@ -175,7 +178,8 @@ def draw_catalogue_errors(
     medians: Mapping[str, float],
 ) -> None:
     """Each error against the figure that it is of, with its median and the thesis's, and maps."""
-    facts, against = facts_of(catalog.hip), measured_values(catalog)
+    facts = facts_of(catalog.hip)
+    against = measured_values(catalog)
     largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
     note = (
         f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand"
@@ -186,7 +190,8 @@ def draw_catalogue_errors(
     with chart(path, text, 4, 2, **layout) as panels:
         titles = dict(zip(TABLE_2_3, NAMES_2_3, strict=True))
         for axes, (name, (unit, printed)) in zip(panels, TABLE_2_3.items(), strict=False):
-            value, high = against[name], CLIPPED_TIMES * printed
+            value = against[name]
+            high = CLIPPED_TIMES * printed
             style: dict[str, Any] = {"cmap": density(), "norm": "log", "rasterized": True}
             style |= {"bins": (120, 60), "range": (value.limits, (0.0, high))}
             axes.hist2d(value.of_star, np.minimum(facts[name], high), **style)
@@ -211,7 +216,8 @@ class MeasuredValue:
 
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
     """What each error of table 2.3 is of, by the error's name."""
-    pm_ra, pm_dec = catalog.pm_ra_cosdec_mas_yr, catalog.pm_dec_mas_yr
+    pm_ra = catalog.pm_ra_cosdec_mas_yr
+    pm_dec = catalog.pm_dec_mas_yr
     return {
         "sigma_bv_mag": MeasuredValue(catalog.bv_mag, "B-V [mag]", (-0.4, 2.2)),
         "sigma_ra_mas": MeasuredValue(catalog.ra_deg, "right ascension [deg]", (0.0, 360.0)),
@@ -231,7 +237,8 @@ def density() -> "Colormap":
 
 def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) -> None:
     """The median of an error over the sky, which Hipparcos scanned about the ecliptic's poles."""
-    ra_edges, dec_edges = np.linspace(0, 360, 73), np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
+    ra_edges = np.linspace(0, 360, 73)
+    dec_edges = np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
     column = np.digitize(catalog.ra_deg, ra_edges) - 1
     row = np.digitize(catalog.dec_deg, dec_edges) - 1
     medians = np.full((len(dec_edges) - 1, len(ra_edges) - 1), np.nan)
@@ -250,10 +257,9 @@ def passbands(directory: Path) -> ChartFinding:
     takes for it.
     """
     light = vega()
-    curves = {
-        b: read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv")
-        for b in TABLE_2_5
-    }
+    curves = {}
+    for b in TABLE_2_5:
+        curves[b] = read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv")
     in_v = curve_mean(light, curves["v"])
     scale = ZERO_W_M2_M["v"] / in_v  # a star with Vega's spectrum and V = 0
     rows = []
@@ -325,25 +331,27 @@ def curves(directory: Path) -> ChartFinding:
     """Figures 5.1, 5.2, 5.20 and 5.21: sensors, glass, and the black bodies that they see."""
     names = ("ccd47-20", "kai-4021", "n-bk7-10mm")
     loaded = {name: load_curve(name, name) for name in names}
-    words = {
+    labels = {
         name: (
             f"{c.wavelength_nm[0]:.0f} to {c.wavelength_nm[-1]:.0f} nm, most at"
             f" {c.wavelength_nm[c.value.argmax()]:.0f}"
         )
         for name, c in loaded.items()
     }
-    text = f"The CCD47-20 sees {words['ccd47-20']}; the approximate KAI-4021 {words['kai-4021']}"
+    text = f"The CCD47-20 sees {labels['ccd47-20']}; the approximate KAI-4021 {labels['kai-4021']}"
     note = (
         "CCD47-20: ULTRACAM's red arm, not the thesis's midband coating. KAI-4021: recalled, not"
         " digitised. Lines: V."
     )
     nm = np.arange(300.0, 1101.0, 2.0)
     kelvin = (3000.0, 5000.0, 9000.0, 30_000.0)
-    bodies = [blackbody_exitance_w_m2_m(nm, each) for each in kelvin]
-    bodies = [each / each.max() for each in bodies]
+    bodies = [blackbody_exitance_w_m2_m(nm, temperature_k) for temperature_k in kelvin]
+    bodies = [temperature_k / temperature_k.max() for temperature_k in bodies]
     v = load_curve("johnson-v", "johnson-v").wavelength_nm
     of_sensors = {name: curve(nm) for name, curve in loaded.items()}
-    of_bodies = {f"{each:.0f} K": body for each, body in zip(kelvin, bodies, strict=True)}
+    of_bodies = {
+        f"{temperature_k:.0f} K": body for temperature_k, body in zip(kelvin, bodies, strict=True)
+    }
     edges = PanelSpec((), "exitance over its largest [1]", "wavelength [nm]")
     with chart(directory / "curves", text, panels=2, note=note) as (upper, lower):
         spec = PanelSpec((), "electrons a photon, transmission [1]")
@@ -351,7 +359,10 @@ def curves(directory: Path) -> ChartFinding:
         draw_curve_panel(lower, CurvePanel(nm, of_bodies, edges))
         for edge in (v[0], v[-1]):
             lower.axvline(edge, color=MUTED, lw=1)
-    columns = {f"blackbody_{each:.0f}_k": body for each, body in zip(kelvin, bodies, strict=True)}
+    columns = {
+        f"blackbody_{temperature_k:.0f}_k": body
+        for temperature_k, body in zip(kelvin, bodies, strict=True)
+    }
     write_columns(directory / "curves.csv", {"wavelength_nm": nm, **of_sensors, **columns})
     return ChartFinding("curves", text)
 
@@ -360,7 +371,8 @@ def detector_laws(directory: Path) -> ChartFinding:
     """Equation 4.12 and figures 4.12 and 4.15: dark current by temperature, read noise by
     readout frequency.
     """
-    kelvin, hz = np.arange(230.0, 300.5, 1.0), np.geomspace(1e4, 1e7, 61)
+    kelvin = np.arange(230.0, 300.5, 1.0)
+    hz = np.geomspace(1e4, 1e7, 61)
     dark = {
         name: np.array(
             [
@@ -440,7 +452,8 @@ def spectra(directory: Path) -> ChartFinding:
     """Black bodies and the Pickles relation, each star held out in turn, against the Pickles
     spectra over V-I.
     """
-    library, photometry = load_library(), Photometry()
+    library = load_library()
+    photometry = Photometry()
     errors: dict[tuple[str, str], FloatArray] = {}  # relative, of each star, by sensor and method
     for sensor in SENSORS:
         optics = study_optics(sensor)
@@ -524,7 +537,8 @@ def zero_points(directory: Path) -> ChartFinding:
         for sensor in SENSORS
     }
     mag = {sensor: magnitude(rate / rate[0]) for sensor, rate in rates.items()}
-    base, cost = rates["ccd47-20"], mag["ccd47-20"]
+    base = rates["ccd47-20"]
+    cost = mag["ccd47-20"]
     text = (
         f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux"
         f" (CCD47-20, 30 mm), {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by"
@@ -543,7 +557,8 @@ def zero_points(directory: Path) -> ChartFinding:
                 bars = axes.bar(place + 0.4 * k - 0.2, height, 0.38, color=colour, label=name)
                 axes.bar_label(bars, fmt=figure, padding=2, fontsize=SMALL_PT)
         upper.set(ylabel="electrons a second [millions]", ylim=(0, 1.3 * base.max() / 1e6))
-        low, high = min(0.0, *(m.min() for m in mag.values())), max(m.max() for m in mag.values())
+        low = min(0.0, *(m.min() for m in mag.values()))
+        high = max(m.max() for m in mag.values())
         # with room for figures and names
         limits = (low - 0.15 * (high - low), high + 0.4 * (high - low))
         lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
@@ -568,7 +583,9 @@ def zero_points(directory: Path) -> ChartFinding:
 def temperature_scales(directory: Path) -> ChartFinding:
     """The scales that a bench file can choose, beside Torres 2010, and their error in electrons."""
     bv = np.union1d(SCALE_BV_MAG, -1e-9)  # both sides of wang2021's step
-    torres, optics, photometry = torres2010_k(bv), study_optics("ccd47-20"), Photometry()
+    torres = torres2010_k(bv)
+    optics = study_optics("ccd47-20")
+    photometry = Photometry()
     base = dgs_electrons_per_s(torres, optics, photometry)
     kelvin = {"torres2010_supergiant": torres2010_k(bv, supergiant=True)}
     kelvin |= {name: scale(bv) for name, scale in TEMPERATURE_SCALES.items()}
@@ -579,11 +596,11 @@ def temperature_scales(directory: Path) -> ChartFinding:
     }
     stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
     stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
-    within = {
-        n: np.percentile(np.abs(np.interp(stars_bv, bv, mag[n])), (50, 95))
-        for n in TEMPERATURE_SCALES
-    }
-    zero, wang = int(np.searchsorted(bv, 0.0)), kelvin["wang2021"]
+    within = {}
+    for n in TEMPERATURE_SCALES:
+        within[n] = np.percentile(np.abs(np.interp(stars_bv, bv, mag[n])), (50, 95))
+    zero = int(np.searchsorted(bv, 0.0))
+    wang = kelvin["wang2021"]
     step_k = wang[zero - 1] - wang[zero]
     text = (
         f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / wang[zero - 1]:.1f} %) at B-V = 0;"
@@ -610,10 +627,10 @@ def temperature_scales(directory: Path) -> ChartFinding:
             for (name, value), style, colour in zip(
                 values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True
             ):
-                words = name.replace("torres2010_supergiant", "Torres, supergiants")
+                label = name.replace("torres2010_supergiant", "Torres, supergiants")
                 if axes is panels[2] and name in within:
-                    words = f"{name}: half within {within[name][0]:.3f}"
-                axes.plot(bv, value, style, color=colour, label=words)
+                    label = f"{name}: half within {within[name][0]:.3f}"
+                axes.plot(bv, value, style, color=colour, label=label)
         for axes in panels[1:]:
             axes.axhline(0, color=INK, lw=1)
         panels[0].set(yscale="log", ylabel="temperature [K]")
@@ -634,7 +651,8 @@ def temperature_scales(directory: Path) -> ChartFinding:
 
 def choices(directory: Path) -> ChartFinding:
     """The cost of each choice in magnitudes, over B-V and for the stars of Hipparcos."""
-    optics, stars = study_optics("ccd47-20"), load_catalog().brighter_than(BRIGHT_V_MAG)
+    optics = study_optics("ccd47-20")
+    stars = load_catalog().brighter_than(BRIGHT_V_MAG)
     cost = choice_costs_mag(BV_MAG, optics)
     real = tabulate_pickles(optics, Photometry()).electrons_per_s(
         np.zeros(len(stars)), stars.bv_mag, stars.vi_mag

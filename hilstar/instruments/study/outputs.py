@@ -154,7 +154,10 @@ def _found(outputs: Outputs) -> str:
     v_mag = truth["v_mag"]
     kelvin = truth["temperature_k"]
     beyond = int((~outputs.inside).sum())
-    edge = f", {beyond} more whose light reaches the image" if beyond else ""
+    if beyond:
+        edge = f", {beyond} more whose light reaches the image"
+    else:
+        edge = ""
     heat = ""
     if np.isfinite(kelvin).any():
         heat = f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
@@ -253,7 +256,8 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
             xlim=(x_px - ZOOM_PX / 2, x_px + ZOOM_PX / 2),
             ylim=(y_px + ZOOM_PX / 2, y_px - ZOOM_PX / 2),
         )
-    facts, scale = panels[2], panels[5]
+    facts = panels[2]
+    scale = panels[5]
     facts.text(0, 1, outputs.camera_words, va="top", transform=facts.transAxes, fontsize=SMALL_PT)
     for axes in (facts, scale):
         axes.axis("off")
@@ -271,5 +275,8 @@ def _zoom(scene: Scene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
         height, width = outputs.noisy.dn.shape
         return "the middle", (width / 2, height / 2)
     star = stars[0]
-    name = f"HIP {star['hip']}" if star["hip"] > 0 else str(star["name"])
+    if star["hip"] > 0:
+        name = f"HIP {star['hip']}"
+    else:
+        name = str(star["name"])
     return name, (float(star["x_px"]), float(star["y_px"]))

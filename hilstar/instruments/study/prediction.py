@@ -99,7 +99,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
     """Measure, and write `prediction.csv` and its chart; a line for each method. Raises
     InputError.
     """
-    span_s, outcomes, others = QUICK_SPAN_S if quick else SPAN_S, [], OtherWork()
+    span_s = QUICK_SPAN_S if quick else SPAN_S
+    outcomes = []
+    others = OtherWork()
     # Over latency at the usual rate, and over rate at the usual latency.
     for hz, ms in sorted(
         {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
@@ -135,18 +137,18 @@ def run(directory: Path, quick: bool = False) -> Judged:
             shaken_by.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
     write_records(directory / "prediction_jitter.csv", shaken_by)
     given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in SENDERS)
-    told = (
+    note = (
         f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
         " nearer than one predicted by"
         f' {USUAL_MS} ms; "auto" is within {auto_times(shaken_by):.1f} times the better of both'
     )
-    draw_shaken(directory / "prediction_jitter", told, shaken_by)
+    draw_shaken(directory / "prediction_jitter", note, shaken_by)
     lines = (
         f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
         f" {o.attitude_us:.0f} us per attitude"
         for o in usual
     )
-    return load.judged([finding, *lines, told])
+    return load.judged([finding, *lines, note])
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,22 +178,22 @@ def shaken_error(
     prediction: Prediction = "auto" if way == "auto" else "rate"
     timeline = Timeline(Policy(0 if way == "newest" else NS_PER_S, NS_PER_S, prediction=prediction))
     latency_s = max(age_ms / 1e3 - 0.5 / packet_hz, 0.0)
-    amplitude, turning = SHAKEN_ARCSEC / ARCSEC_PER_RAD, math.tau * jitter_hz
+    amplitude = SHAKEN_ARCSEC / ARCSEC_PER_RAD
+    turning = math.tau * jitter_hz
 
     def angle(t_s: float) -> float:
         return turn * t_s + amplitude * math.sin(turning * t_s + 0.3)
 
-    taken, errors, times_s = (
-        0,
-        [],
-        np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s,
-    )
+    taken = 0
+    errors = []
+    times_s = np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s
     for t_s in times_s:
         while taken / packet_hz <= t_s - latency_s:
             at_s = taken / packet_hz
-            rate = (
-                Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3)) if rates else None
-            )
+            if rates:
+                rate = Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3))
+            else:
+                rate = None
             timeline.add(
                 AttitudeSample(round(at_s * NS_PER_S), propagate(ORION, Z, angle(at_s)), rate)
             )
@@ -203,7 +205,8 @@ def shaken_error(
             )[2]
         )
     late = times_s >= SETTLED_S
-    phase, error = turning * times_s[late] + 0.3, np.array(errors)[late]
+    phase = turning * times_s[late] + 0.3
+    error = np.array(errors)[late]
     waves = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(phase))))
     fitted = np.linalg.lstsq(waves, error + amplitude * np.sin(phase), rcond=None)[0]
     return float(np.sqrt(2 * np.mean(error**2)) / amplitude), float(
@@ -240,7 +243,8 @@ def _outcome(
     predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int
 ) -> PredictionOutcome:
     taken_ns = [sample.t_ns for sample in samples]
-    latency_ns, errors = latency_ms * NS_PER_MS, []
+    latency_ns = latency_ms * NS_PER_MS
+    errors = []
     first, last = (
         t_ns * FRAME_HZ / NS_PER_S for t_ns in (taken_ns[NEAR] + latency_ns, taken_ns[-1])
     )
@@ -249,7 +253,8 @@ def _outcome(
         count = bisect_right(taken_ns, t_ns - latency_ns)
         shown = predictor.load(samples[count - NEAR : count])(t_ns)
         errors.append(angle_between_rad(slew_attitude(t_ns), shown) * ARCSEC_PER_RAD)
-    predict, times_us = predictor.load(samples[-NEAR:]), []
+    predict = predictor.load(samples[-NEAR:])
+    times_us = []
     for _ in range(TIMED):
         begin_ns = time.perf_counter_ns()
         predict(taken_ns[-1] + latency_ns)

@@ -47,21 +47,23 @@ def predictors() -> tuple[Predictor, ...]:
     fed with rates.
     """
     settings = AttitudeSettings()
-    own = Policy(
+    bench_policy = Policy(
         round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS)
     )
-    hold = Policy(0, own.stale_after_ns)
+    hold = Policy(0, bench_policy.stale_after_ns)
     return (
         Predictor("hold", partial(_timeline, hold)),
         Predictor(
             "linear, by the sample's rate",
-            partial(_timeline, own),
-            is_default=own.max_extrapolation_ns > 0,
+            partial(_timeline, bench_policy),
+            is_default=bench_policy.max_extrapolation_ns > 0,
         ),
-        Predictor("linear, by the last two samples", partial(_timeline, own, without_rates=True)),
+        Predictor(
+            "linear, by the last two samples", partial(_timeline, bench_policy, without_rates=True)
+        ),
         Predictor("rate and acceleration", _accelerated),
         Predictor(f"cubic spline through {NEAR} samples", _spline),
-        Predictor("C2 blend, a sample later", partial(_timeline, own), waits=True),
+        Predictor("C2 blend, a sample later", partial(_timeline, bench_policy), waits=True),
     )
 
 
@@ -97,7 +99,8 @@ def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
     """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz,
     0.0003 arcsec predicted.
     """
-    before, after = attitude(t_ns - RATE_STEP_NS), attitude(t_ns + RATE_STEP_NS)
+    before = attitude(t_ns - RATE_STEP_NS)
+    after = attitude(t_ns + RATE_STEP_NS)
     return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
 
 
@@ -134,7 +137,9 @@ class Movement:
 
     def rate_rad_s(self, t_ns: int) -> FloatArray:
         """The true rate (3,) of cam in icrs, cam components, jitter included."""
-        return rate_of(self.at, t_ns) if self.turns and self.shaken else self.turn_rad_s
+        if self.turns and self.shaken:
+            return rate_of(self.at, t_ns)
+        return self.turn_rad_s
 
     def samples(self, until_ns: int) -> list[AttitudeSample]:
         """The newest NEAR samples at time `until_ns`."""
@@ -172,7 +177,8 @@ def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
     )
 
     def predicted(t_ns: int) -> FloatArray:
-        ahead_s, gap_s = (t_ns - newest_ns) / NS_PER_S, (newest_ns - before_ns) / NS_PER_S
+        ahead_s = (t_ns - newest_ns) / NS_PER_S
+        gap_s = (newest_ns - before_ns) / NS_PER_S
         bend = (newest - before) / gap_s
         return propagate(near[-1].q_icrs_to_cam, newest + 0.5 * ahead_s * bend, ahead_s)
 

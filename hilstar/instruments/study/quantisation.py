@@ -50,14 +50,14 @@ MARKERS = dict(zip(codes.BITS, "os^", strict=True))
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
-    found: Found = {
+    errors_by_way: Found = {
         (bits, way.name): codes.code_errors(bits, way, phases, mags)
         for bits in codes.BITS
         for way in codes.WAYS
     }
     rows = [
         (bits, name, float(mag), *codes.error_cells(e))
-        for (bits, name), errors in found.items()
+        for (bits, name), errors in errors_by_way.items()
         for mag, e in zip(mags, errors, strict=True)
     ]
     write_csv(
@@ -67,12 +67,12 @@ def run(directory: Path, quick: bool = False) -> Judged:
     )
     faintest = {
         key: errors[int(np.searchsorted(mags, codes.AIMS[key[0]][1]))]
-        for key, errors in found.items()
+        for key, errors in errors_by_way.items()
     }
     others = OtherWork()
     times = _frame_times_ms(3 if quick else 31)
     load = others.load()
-    _draw_magnitudes(directory / "quantisation", found, mags)
+    _draw_magnitudes(directory / "quantisation", errors_by_way, mags)
     draw_each(directory / "quantisation_centroiders", centroider_errors(faintest))
     _draw_times(directory / "quantisation_time", faintest, times, load)
     write_csv(
@@ -85,17 +85,17 @@ def run(directory: Path, quick: bool = False) -> Judged:
     )
     coarsest = codes.BITS[0]
     rounded, exact = (faintest[coarsest, name] for name in ("round", "exact"))
-    left = ", ".join(
+    ratios_text = ", ".join(
         f"{kind} {exact.axis_rms_px(kind) / rounded.axis_rms_px(kind):.2f}"
         f" ({exact.axis_rms_px(kind):.4f} px)"
         for kind in FAMILY
     )
     ms = ", ".join(f"{way.method} {times[10, way.name]:.1f} ms" for way in codes.WAYS[:4])
     lines = [
-        *(_summary(bits, found, mags) for bits in codes.BITS),
+        *(_summary(bits, errors_by_way, mags) for bits in codes.BITS),
         (
             f"{coarsest} bits, {codes.AIMS[coarsest][1]:g} magnitudes under white: of the error of"
-            f" round (rms along an axis) exact leaves, by each centroider, {left}"
+            f" round (rms along an axis) exact leaves, by each centroider, {ratios_text}"
         ),
         (
             f"{codes.STARS} stars, {codes.FRAME_PX[0]} x {codes.FRAME_PX[1]}, 10 bits, from light"
@@ -119,12 +119,11 @@ def _frame_times_ms(rounds: int) -> dict[tuple[int, str], float]:
 
     for bits in codes.BITS:
         with ExitStack() as stack:
-            targets = {
-                way.name: Target(
+            targets = {}
+            for way in codes.WAYS:
+                targets[way.name] = Target(
                     codes.FRAME_PX, USUAL_PSF, codes.response_of(bits, way), WHITE, way.method
                 )
-                for way in codes.WAYS
-            }
             works = {
                 name: partial(draw, stack.enter_context(Renderer(on)))
                 for name, on in targets.items()
@@ -155,7 +154,8 @@ def _worst(errors: list[StarErrors], mags: FloatArray, limit_mag: float) -> str:
 
 
 def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
-    bits, limit = codes.BITS[1], codes.AIMS[codes.BITS[1]][1]
+    bits = codes.BITS[1]
+    limit = codes.AIMS[codes.BITS[1]][1]
     exact, rounded = (_worst(found[bits, name], mags, limit) for name in ("exact", "round"))
     finding = (
         f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with"
@@ -175,7 +175,8 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
                     (place, [e.max_px(codes.JUDGE) for e in errors]),
                 ):
                     shown = np.where(np.isfinite(values), np.maximum(values, MIN_ERROR), np.nan)
-                    label, style = way.name.replace("mean of ", ""), ":" if way.stealing else "-"
+                    label = way.name.replace("mean of ", "")
+                    style = ":" if way.stealing else "-"
                     axes.semilogy(mags, shown, style, color=way.colour, lw=1.5, label=label)
             for axes, aim in ((flux, aim_mag), (place, codes.AIM_PX)):
                 axes.plot(
@@ -210,7 +211,8 @@ def centroider_errors(faintest: dict[tuple[int, str], StarErrors]) -> list[Centr
     """The errors at the faint end by bits and centroider."""
     rows = []
     for bits, kind in product(codes.BITS, FAMILY):
-        rounded, exact = faintest[bits, "round"], faintest[bits, "exact"]
+        rounded = faintest[bits, "round"]
+        exact = faintest[bits, "exact"]
         errors_px = rounded.axis_rms_px(kind), exact.axis_rms_px(kind)
         rows.append(CentroiderErrors(bits, kind, *errors_px))
     return rows

@@ -236,8 +236,14 @@ def draw_line(axes: "Axes", line: LineSpec, look: SeriesLook, series: Sequence[A
         return
     label = HIDDEN
     if line.named:
-        label = look.label if line.label is None else line.label(rows[0])
-    marker = look.marker if line.marker is None else line.marker
+        if line.label is None:
+            label = look.label
+        else:
+            label = line.label(rows[0])
+    if line.marker is None:
+        marker = look.marker
+    else:
+        marker = line.marker
     style: dict[str, Any] = {"ls": line.style, "color": look.colour, "label": label}
     axes.plot(values(rows, line.x), values(rows, line.y), marker=marker, **{**style, **line.look})
 
@@ -272,7 +278,8 @@ def finite(name: str, below: float = np.inf) -> Callable[[Any], float]:
 def draw_pairs(axes: "Axes", spec: PairSpec, rows: Sequence[Any]) -> None:
     """Draw the pairs of rows, the first row's place 0, on a logarithmic axis."""
     places = range(len(rows))
-    first, second = values(rows, spec.first), values(rows, spec.second)
+    first = values(rows, spec.first)
+    second = values(rows, spec.second)
     for place, (low, high) in enumerate(zip(first, second, strict=True)):
         axes.plot([low, high], [place, place], color=MUTED, lw=1)
     first_look, second_look = spec.looks

@@ -67,10 +67,10 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
     for k in range(len(rates)):
         rest = np.arange(len(rates)) != k
         table = fit_table(library.bv_mag[rest], library.vi_mag[rest], rates[rest])
-        one = table.electrons_per_s(
+        rate_table = table.electrons_per_s(
             np.zeros(1), library.bv_mag[k : k + 1], library.vi_mag[k : k + 1]
         )
-        errors[k] = one[0] / rates[k] - 1
+        errors[k] = rate_table[0] / rates[k] - 1
     return errors
 
 
@@ -80,16 +80,17 @@ def held_out_by_type(rates: FloatArray) -> FloatArray:
     """
     library = bare_and_dusty()
     kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
-    count, errors = len(rates) // 2, np.empty(len(rates))
+    count = len(rates) // 2
+    errors = np.empty(len(rates))
     for k in range(count):
-        own = np.array([k, k + count])
-        rest = np.delete(np.arange(len(rates)), own)
+        own_rows = np.array([k, k + count])
+        rest = np.delete(np.arange(len(rates)), own_rows)
         part = replace(library, bv_mag=library.bv_mag[rest], vi_mag=library.vi_mag[rest])
         table = fit_spectra(kind[rest], part, rates[rest])
-        found = table.electrons_per_s(
-            np.zeros(2), library.bv_mag[own], library.vi_mag[own], kind[own]
+        predicted = table.electrons_per_s(
+            np.zeros(2), library.bv_mag[own_rows], library.vi_mag[own_rows], kind[own_rows]
         )
-        errors[own] = found / rates[own] - 1
+        errors[own_rows] = predicted / rates[own_rows] - 1
     return errors
 
 
@@ -118,9 +119,11 @@ def lone_windows(
     """
     light, (width, height), margin = sprites.data["electrons_per_s"], size_px, isolation.margin_px
     for star in np.unique(sprites.star):
-        own = sprites.star == star
-        left, right = x_px[own].min() - margin, x_px[own].max() + margin
-        top, bottom = y_px[own].min() - margin, y_px[own].max() + margin
+        is_own = sprites.star == star
+        left = x_px[is_own].min() - margin
+        right = x_px[is_own].max() + margin
+        top = y_px[is_own].min() - margin
+        bottom = y_px[is_own].max() + margin
         if left < 0 or top < 0 or right > width - 1 or bottom > height - 1:
             continue
         near = (
@@ -128,9 +131,9 @@ def lone_windows(
             & (x_px < right + margin)
             & (y_px > top - margin)
             & (y_px < bottom + margin)
-            & ~own
+            & ~is_own
         )
-        if light[near].sum() <= isolation.max_share * light[own].sum():
+        if light[near].sum() <= isolation.max_share * light[is_own].sum():
             yield int(star), (slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
 
 
@@ -139,12 +142,13 @@ def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
     side, side), side odd.
     """
     side = max(part.stop - part.start for window in windows for part in window) | 1
-    found = np.zeros((len(windows), side, side))
-    for square, window in zip(found, windows, strict=True):
+    stamps = np.zeros((len(windows), side, side))
+    for square, window in zip(stamps, windows, strict=True):
         height, width = image[window].shape
-        top, left = (side - height) // 2, (side - width) // 2
+        top = (side - height) // 2
+        left = (side - width) // 2
         square[top : top + height, left : left + width] = image[window]
-    return found
+    return stamps
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +163,8 @@ class StarError:
 
 def star_error(shown: FloatArray, true: FloatArray, window: Window) -> StarError:
     """The error of the star in a window of `shown`, against the same window of `true`."""
-    light, true_light = float(shown[window].sum()), float(true[window].sum())
+    light = float(shown[window].sum())
+    true_light = float(true[window].sum())
     (x_px, y_px), (true_x_px, true_y_px) = centroid_px(shown, window), centroid_px(true, window)
     return StarError(magnitude(light / true_light), math.hypot(x_px - true_x_px, y_px - true_y_px))
 

@@ -162,12 +162,14 @@ def equation_2_3(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
 
 
 def _about_z(angle: float) -> FloatArray:
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 def _about_x(angle: float) -> FloatArray:
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
@@ -195,7 +197,8 @@ def sun(directory: Path) -> ChartFinding:
     note = (
         "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
     )
-    observed, shown_body = spectrum(SHOWN_NM), body(SHOWN_NM)
+    observed = spectrum(SHOWN_NM)
+    shown_body = body(SHOWN_NM)
     curves = {
         f"{SUN_TYPE}, observed": observed,
         f"black body, {SUN_TEMPERATURE_K:.0f} K": shown_body,
@@ -212,7 +215,8 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
     """Figure 2.13, right: Vega on logarithmic scales, beside the thesis's black body."""
     light = vega()
     shown = (light.wavelength_nm >= VEGA_NM[0]) & (light.wavelength_nm <= VEGA_NM[1])
-    nm, value = light.wavelength_nm[shown], light.value[shown]
+    nm = light.wavelength_nm[shown]
+    value = light.value[shown]
     johnson_v = load_curve("johnson-v", "johnson-v")
     flux = value / curve_mean(light, johnson_v) * ZERO_W_M2_M["v"]
     body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
@@ -243,7 +247,8 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
 
 def backgrounds(directory: Path) -> ChartFinding:
     """Figure 4.11: zodiacal light and the other lights between the stars near the Earth."""
-    zodiacal, earthshine = read_curve_csv(HST_ZODIACAL), read_curve_csv(EARTHSHINE)
+    zodiacal = read_curve_csv(HST_ZODIACAL)
+    earthshine = read_curve_csv(EARTHSHINE)
     lights: dict[str, FloatArray] = {"zodiacal, V = 22.1": _photons(zodiacal)}
     lights |= {name: times * _photons(earthshine) for name, times in EARTHSHINES.items()}
     lights["from the ground"] = _glow_photons()

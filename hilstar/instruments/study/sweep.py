@@ -82,7 +82,8 @@ class Spent(NamedTuple):
 
 def spent(work: Callable[[], object]) -> Spent:
     """Call a work once and time it."""
-    begin_cpu, begin = time.process_time(), time.perf_counter()
+    begin_cpu = time.process_time()
+    begin = time.perf_counter()
     work()
     wall_s = time.perf_counter() - begin
     return Spent(1e3 * wall_s, 1e3 * (time.process_time() - begin_cpu))
@@ -98,10 +99,11 @@ def in_turn(
     fills caches.
     """
     times: dict[str, list[Spent]] = {name: [] for name in works}
-    names, rng = list(works), np.random.default_rng(SEED)
+    names = list(works)
+    rng = np.random.default_rng(SEED)
     for number in range(rounds + 1):
         for name in (names[k] for k in rng.permutation(len(names))):
-            if number <= MIN_ROUNDS or sum(one.wall_ms for one in times[name]) <= 1e3 * share_s:
+            if number <= MIN_ROUNDS or sum(taken.wall_ms for taken in times[name]) <= 1e3 * share_s:
                 took = spent(partial(works[name], number))
                 times[name] += [took] if number else []
     return times
@@ -110,7 +112,7 @@ def in_turn(
 def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
     """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
     return {
-        name: float(np.median([one.wall_ms for one in took]))
+        name: float(np.median([taken_time.wall_ms for taken_time in took]))
         for name, took in in_turn(works, rounds).items()
     }
 
@@ -120,7 +122,8 @@ def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
 
     A method beats another whose error and time are both no smaller, and one of them larger.
     """
-    error, taken = np.asarray(errors, dtype=np.float64), np.asarray(times_ms, dtype=np.float64)
+    error = np.asarray(errors, dtype=np.float64)
+    taken = np.asarray(times_ms, dtype=np.float64)
     as_good = (error <= error[:, None]) & (taken <= taken[:, None])
     return np.asarray(as_good & ((error < error[:, None]) | (taken < taken[:, None])))
 
@@ -147,7 +150,9 @@ class OtherWork:
         all_s, others_s = (
             now - before for now, before in zip(self._times_s(), self._before, strict=True)
         )
-        return max(others_s, 0.0) / all_s * (os.cpu_count() or 1) if all_s > 0 else 0.0
+        if all_s > 0:
+            return max(others_s, 0.0) / all_s * (os.cpu_count() or 1)
+        return 0.0
 
     def load(self) -> Load:
         """What the others took since creation."""
@@ -159,16 +164,17 @@ class OtherWork:
         other processes.
         """
         try:
-            ticks = [
-                int(word)
-                for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]
-            ]
+            ticks = []
+            for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]:
+                ticks.append(int(word))
         except (OSError, ValueError):
             return 0.0, 0.0
         each_s = 1 / os.sysconf("SC_CLK_TCK")
         user, nice, system, idle, waiting, *interrupts = ticks
         busy = user + nice + system + sum(interrupts)
-        own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        own_usage = [
+            resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        ]
         return (busy + idle + waiting) * each_s, busy * each_s - sum(
-            used.ru_utime + used.ru_stime for used in own
+            used.ru_utime + used.ru_stime for used in own_usage
         )

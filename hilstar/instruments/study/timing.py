@@ -151,7 +151,8 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
         "collimator": {"focal_length_mm": 350},
     }
     rolling: settings.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
-    view, light = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s), []
+    view = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s)
+    light = []
     for extra in ({"tracker.detector": rolling}, {}):
         with TemporaryDirectory() as folder:
             path = Path(folder) / "bench.toml"
@@ -162,11 +163,9 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
                 tracker.expose(view, None).mean_e[::EVERY_ROWS, 0]
             )  # the left edge: the boresight's stars are elsewhere
             tracker.close()
-    config, x, y = (
-        file.config,
-        np.zeros(STRIPE_ROWS)[::EVERY_ROWS],
-        np.arange(float(STRIPE_ROWS))[::EVERY_ROWS],
-    )
+    config = file.config
+    x = np.zeros(STRIPE_ROWS)[::EVERY_ROWS]
+    y = np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
     geometry = BenchGeometry(
         bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent)
     )
@@ -209,7 +208,8 @@ def stripe_depth(points: list[StripePoint], whole: bool) -> float:
 def draw_stripes(path: Path, points: list[StripePoint]) -> str:
     """The chart of the cases; its finding."""
     off = max(abs(point.light - point.foretold) for point in points)
-    whole, parted = stripe_depth(points, True), stripe_depth(points, False)
+    whole = stripe_depth(points, True)
+    parted = stripe_depth(points, False)
     finding = (
         f"Behind a rolling shutter a display's stripes are up to {100 * parted:.0f} % of its light,"
         f" {100 * whole:.0f} % where exposures are whole refreshes: as foretold within"
@@ -316,7 +316,10 @@ class ScanningPanel(Closing):
 
     def levels(self, attitude: Attitude, number: int) -> Levels:
         """Draw one frame: its levels (H, W)."""
-        rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
+        if self.bench.config.render.motion == "on":
+            rate = attitude.rate_cam_rad_s
+        else:
+            rate = None
         return self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels
 
     def exposed_e_per_s(self, movement: Movement) -> FloatArray:
@@ -445,12 +448,11 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
 def _exposure_points(
     case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement
 ) -> Iterator[BeatPoint]:
-    shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
-    paths, to_tracker, camera = (
-        sky.paths(movement),
-        panel.optics.geometry.to_tracker,
-        panel.bench.camera,
-    )
+    shown = panel.exposed_e_per_s(movement)
+    true = sky.exposed_e_per_s(movement)
+    paths = sky.paths(movement)
+    to_tracker = panel.optics.geometry.to_tracker
+    camera = panel.bench.camera
     windows = list(
         settings.lone_windows(
             paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION
@@ -586,7 +588,8 @@ class TimingOutcome:
 
 def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingOutcome:
     """One compensation on one slew, against the sky."""
-    shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
+    shown = panel.exposed_e_per_s(movement)
+    true = sky.exposed_e_per_s(movement)
     paths = sky.paths(movement)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
     windows = settings.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
@@ -612,10 +615,9 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
 def measure(quick: bool = False) -> list[TimingOutcome]:
     """Every compensation at every rate."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        panels = [
-            stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml"))
-            for k, way in enumerate(WAYS)
-        ]
+        panels = []
+        for k, way in enumerate(WAYS):
+            panels.append(stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml")))
         sky = stack.enter_context(TimingSky(panels[0]))
         return [
             compare(panel, sky, slew(rate))
@@ -633,12 +635,13 @@ def run(directory: Path, quick: bool = False) -> Judged:
     load = others.load()
     write_records(directory / "timing.csv", outcomes)
     finding = draw(directory / "timing", outcomes, load)
-    lines = [
-        f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
-        f" {o.flux_rms_mag:.2g} mag rms, {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
-        for o in outcomes
-        if o.rate_deg_s == QUICK_RATES_DEG_S[0]
-    ]
+    lines = []
+    for o in outcomes:
+        if o.rate_deg_s == QUICK_RATES_DEG_S[0]:
+            lines.append(
+                f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
+                f" {o.flux_rms_mag:.2g} mag rms, {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
+            )
     return load.judged(
         [
             finding,

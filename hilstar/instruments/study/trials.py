@@ -136,10 +136,10 @@ def quartiles_ms(times: Sequence[Spent]) -> tuple[float, float, float]:
 def beaten_words(default: Trial, best: Trial) -> str:
     """By how much a method beats the default."""
     saved = 100 * (1 - best.time_ms / default.time_ms)
-    words = f"'{best.method}' is no worse and takes {saved:.0f} % less time"
+    comparison_text = f"'{best.method}' is no worse and takes {saved:.0f} % less time"
     if best.quartiles_ms[1] >= default.quartiles_ms[0]:
-        return f"{words}, and the quartiles of both overlap"
-    return words
+        return f"{comparison_text}, and the quartiles of both overlap"
+    return comparison_text
 
 
 def table_lines(step: Trials) -> list[str]:
@@ -168,7 +168,8 @@ def table_lines(step: Trials) -> list[str]:
 
 def finding(step: Trials) -> str:
     """The title of a step's chart; its times only where they can be judged."""
-    default, exact = step.default, next((trial for trial in step.trials if trial.is_exact), None)
+    default = step.default
+    exact = next((trial for trial in step.trials if trial.is_exact), None)
     off = f"is off by {said(default.error, step.error)}"
     if default.error <= step.error.floor:
         off = "has no error"

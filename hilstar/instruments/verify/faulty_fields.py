@@ -73,7 +73,8 @@ class FaultyFields:
     """Shows faults one by one on a twin's bench."""
 
     def __init__(self, twin: Twin, scenario: Scenario, rng: np.random.Generator) -> None:
-        self._twin, self._rng = twin, rng
+        self._twin = twin
+        self._rng = rng
         self._view: FaultView = display_view(twin.bench, scenario)
         self._faults = scenario.prepared(self._view.prepare)
         self._finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
@@ -90,10 +91,12 @@ class FaultyFields:
                 fault.KIND,
                 note="of the run's frames: a field that stands still has none",
             )
-        q, first_frame = self._attitude(fault), int(self._rng.integers(0, MASK_TURNS))
+        q = self._attitude(fault)
+        first_frame = int(self._rng.integers(0, MASK_TURNS))
         since_ns = (lasts_ns(fault) or 0) // 2
         effects = FaultLayer(self._view, (Now(1, fault, since_ns),))
-        plain, faulty = self._shot(q, first_frame, None), self._shot(q, first_frame, effects)
+        plain = self._shot(q, first_frame, None)
+        faulty = self._shot(q, first_frame, effects)
         if isinstance(fault, AttitudeStep):
             return FaultSeen(fault.name, fault.KIND, off_px=self._stars_off_px(faulty))
         if isinstance(fault, Blank):
@@ -103,15 +106,18 @@ class FaultyFields:
         return self._compared(fault, plain, faulty)
 
     def _compared(self, fault: Fault, plain: _Shot, faulty: _Shot) -> FaultSeen:
-        asked, shown = faulty.asked_e - plain.asked_e, faulty.shown_e - plain.shown_e
+        asked = faulty.asked_e - plain.asked_e
+        shown = faulty.shown_e - plain.shown_e
         if isinstance(fault, PointLight | StarGone):
             source = plain if isinstance(fault, StarGone) else faulty
             place = self._place_px(fault, source.frame)
             if place is None or not self._whole(place):
                 return FaultSeen(fault.name, fault.KIND, note="not on the tracker's image")
             window = self._window(place)
-            asked, shown = asked[window], shown[window]
-        asked_e, seen_e = float(asked.sum()), float(shown.sum())
+            asked = asked[window]
+            shown = shown[window]
+        asked_e = float(asked.sum())
+        seen_e = float(shown.sum())
         if not abs(asked_e) > 0:
             return FaultSeen(
                 fault.name,
@@ -128,7 +134,8 @@ class FaultyFields:
         return FaultSeen(fault.name, fault.KIND, asked_e, seen_e, flux_mag, off_px)
 
     def _shot(self, q: FloatArray, first_frame: int, effects: FaultLayer | None) -> _Shot:
-        twin, exposure_s = self._twin, self._twin.config.tracker.exposure_s
+        twin = self._twin
+        exposure_s = self._twin.config.tracker.exposure_s
         frame = twin.bench.frame(q, first_frame, faults=effects)
         lights = exposure_lights(twin.bench, frame, first_frame, [twin.true_panel], effects)
         asked = twin.sky_optics.image_e_per_s(frame.linear) * exposure_s
@@ -137,19 +144,16 @@ class FaultyFields:
 
     def _attitude(self, fault: Fault) -> FloatArray:
         """An attitude at which a fault falls on the image; any one where that does not matter."""
-        rng, toward = self._rng, self._direction(fault)
+        rng = self._rng
+        toward = self._direction(fault)
         if toward is None:
             q = rng.normal(size=4)
             return np.asarray(q / np.linalg.norm(q))
-        ra_deg, dec_deg = (
-            np.degrees(np.arctan2(toward[1], toward[0])),
-            np.degrees(np.arcsin(np.clip(toward[2], -1, 1))),
-        )
+        ra_deg = np.degrees(np.arctan2(toward[1], toward[0]))
+        dec_deg = np.degrees(np.arcsin(np.clip(toward[2], -1, 1)))
         q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))
-        angle, off = (
-            rng.uniform(0, 2 * np.pi),
-            OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random()),
-        )
+        angle = rng.uniform(0, 2 * np.pi)
+        off = OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random())
         return propagate(
             q, off * self._view_rad * np.array([math.cos(angle), math.sin(angle), 0.0]), 1.0
         )
@@ -200,13 +204,16 @@ class FaultyFields:
         truth = shot.frame.rows
         x_px, y_px = self._twin.assumed_geometry.to_tracker(truth["x_px"], truth["y_px"])
         match = self._finder.match(shot.shown_e, x_px, y_px)
-        found = match.index >= 0
-        if not found.any():
+        is_matched = match.index >= 0
+        if not is_matched.any():
             return None
-        its = match.index[found]
+        its = match.index[is_matched]
         return float(
             np.median(
-                np.hypot(match.found.x_px[its] - x_px[found], match.found.y_px[its] - y_px[found])
+                np.hypot(
+                    match.found.x_px[its] - x_px[is_matched],
+                    match.found.y_px[its] - y_px[is_matched],
+                )
             )
         )
 
@@ -219,7 +226,10 @@ def _middle(light: FloatArray) -> FloatArray:
 
 def fault_lines(seen: list[FaultSeen]) -> list[str]:
     """The figures for a person, a line for each fault."""
-    return [f"{'fault':20}{one.name} ({one.kind}): {_words(one)}" for one in seen]
+    return [
+        f"{'fault':20}{fault_seen.name} ({fault_seen.kind}): {_words(fault_seen)}"
+        for fault_seen in seen
+    ]
 
 
 def _words(one: FaultSeen) -> str:

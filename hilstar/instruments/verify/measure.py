@@ -105,32 +105,36 @@ def fit_geometry(rows: FloatArray, tracker: Camera, limit_px: float) -> Geometry
     if len(rows) < MIN_STARS:
         return None
     focal_px = tracker.focal_length_px
-    seen = (rows[:, :2] + rows[:, 2:] - tracker.principal_point_px) / focal_px
+    seen_tangents = (rows[:, :2] + rows[:, 2:] - tracker.principal_point_px) / focal_px
     back = -rows[:, 2:] / focal_px
     for _ in range(TRIMS):
         # Another star that was found near a star's place is none of these.
-        off = _lengths(_fits(seen, back)[-1].rest)
-        kept = off <= max(WILD * float(np.median(off)), limit_px / focal_px)
-        if kept.sum() < MIN_STARS:
+        off = _lengths(_fits(seen_tangents, back)[-1].rest)
+        is_kept = off <= max(WILD * float(np.median(off)), limit_px / focal_px)
+        if is_kept.sum() < MIN_STARS:
             break
-        seen, back = seen[kept], back[kept]
-    fits = _fits(seen, back)
+        seen_tangents = seen_tangents[is_kept]
+        back = back[is_kept]
+    fits = _fits(seen_tangents, back)
     good = ENOUGH * min(fit.noise for fit in fits) + ENOUGH_OF_LIMIT * limit_px / focal_px
     return _summed_up(next(fit for fit in fits if fit.noise <= good), back.T.ravel(), focal_px)
 
 
 def _fits(seen: FloatArray, back: FloatArray) -> "list[_MotionFit]":
     """Every model that so many stars (n, 2) can determine, the smallest first."""
-    parts, wanted = _parts(*seen.T), back.T.ravel()
+    parts = _parts(*seen.T)
+    wanted = back.T.ravel()
     fits = [_MotionFit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
     return [fit for fit in fits if MIN_RESIDUALS * fit.unknowns <= len(wanted)]
 
 
 def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
     """The displacements (2 n, unknowns), x then y, by a unit of each unknown of the parts."""
-    one, none, r2 = np.ones_like(x), np.zeros_like(x), x * x + y * y
+    ones = np.ones_like(x)
+    none = np.zeros_like(x)
+    r2 = x * x + y * y
     pairs = {
-        ALIGNED: [(x, y), (-y, x), (one, none), (none, one)],
+        ALIGNED: [(x, y), (-y, x), (ones, none), (none, ones)],
         TILT: [(x * y, y * y), (-x * x, -x * y)],
         LENS: [(x * r2, y * r2)],
         HIGHER: [(x * r2**2, y * r2**2)],
@@ -158,9 +162,9 @@ class _MotionFit:
         design = np.hstack(list(parts.values()))
         values = np.linalg.lstsq(design, wanted, rcond=None)[0]
         ends = np.cumsum([part.shape[1] for part in parts.values()])
-        found = dict(zip(parts, np.split(values, ends[:-1]), strict=True))
-        moved = {name: part @ found[name] for name, part in parts.items()}
-        return cls(found, moved, wanted - design @ values, design.shape[1])
+        values_by_part = dict(zip(parts, np.split(values, ends[:-1]), strict=True))
+        moved = {name: part @ values_by_part[name] for name, part in parts.items()}
+        return cls(values_by_part, moved, wanted - design @ values, design.shape[1])
 
     @property
     def noise(self) -> float:
@@ -186,7 +190,8 @@ def _lengths(residuals: FloatArray) -> FloatArray:
 def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> GeometryFit:
     scale, rotation, right, down = fit.found[ALIGNED].tolist()
     backwards = complex(1.0 + scale, rotation)
-    forwards, shift = 1.0 / backwards, -complex(right, down) / backwards
+    forwards = 1.0 / backwards
+    shift = -complex(right, down) / backwards
     a, b = fit.found.get(TILT, np.zeros(2)).tolist()
     total = float(wanted @ wanted)
     return GeometryFit(
@@ -311,7 +316,7 @@ def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
         return None
     x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
     to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)
-    fainter = [abs(magnitude(float(one))) for one in light if one > 0]
+    fainter = [abs(magnitude(float(star_light))) for star_light in light if star_light > 0]
     return GlassEffect(
         *(
             float(np.percentile(part, 95))
@@ -329,12 +334,12 @@ def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
     owner = _owners(
         np.column_stack([seen.x_px, seen.y_px]) / psf.width_px, seen.truth["electrons_per_s"]
     )
-    own = np.arange(len(owner))
-    if np.array_equal(owner, own):
+    own_index = np.arange(len(owner))
+    if np.array_equal(owner, own_index):
         return seen
     light = seen.truth["electrons_per_s"]
     total = np.bincount(owner, light, len(owner))
-    stars = np.flatnonzero(owner == own)
+    stars = np.flatnonzero(owner == own_index)
 
     def centre(places_px: FloatArray) -> FloatArray:
         moment = np.bincount(owner, light * (places_px - places_px[owner]), len(owner))[stars]
@@ -352,7 +357,8 @@ def _owners(places: FloatArray, light: FloatArray) -> IntArray:
     """For each star (n,) at places (n, 2), in sigmas, the one that it is added to: itself, or a
     brighter one.
     """
-    owner, near = np.arange(len(light)), defaultdict[int, list[int]](list)
+    owner = np.arange(len(light))
+    near = defaultdict[int, list[int]](list)
     a, b, _ = neighbours(places, places, BLEND_SIGMAS)
     for star, other in np.stack([a, b], axis=1)[a != b].tolist():
         near[star].append(other)
@@ -376,45 +382,50 @@ class Comparison:
     def add(self, seen: TwinField, rng: np.random.Generator) -> None:
         """Compare the stars of one field; the generator is for the detector's noise."""
         self.field_count += 1
-        tally, stars_listed = self.tally, len(seen.truth)
+        tally = self.tally
+        stars_listed = len(seen.truth)
         seen = with_blends_as_one(seen, self.finder.psf)
         tally.summed += stars_listed - len(seen.truth)
         windowed = [
             self.finder.find(image_e, seen.x_px, seen.y_px)
             for image_e in (seen.sky_e, seen.shown_e)
         ]
-        images_e, true_px = (seen.sky_e, seen.shown_e), (seen.x_px, seen.y_px)
-        each = {
+        images_e = (seen.sky_e, seen.shown_e)
+        true_px = (seen.x_px, seen.y_px)
+        errors_by_kind = {
             kind: [
                 self.finder.placed(of, image_e, true_px, kind)
                 for of, image_e in zip(windowed, images_e, strict=True)
             ]
             for kind in dict.fromkeys([*FAMILY, self.finder.centroider])
         }
-        sky, shown = each[self.finder.centroider]
-        assumed = (
-            shown
-            if seen.assumed_e is seen.shown_e
-            else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
-        )
-        inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]
+        sky, shown = errors_by_kind[self.finder.centroider]
+        if seen.assumed_e is seen.shown_e:
+            assumed = shown
+        else:
+            assumed = self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
+        inside = self._inside(seen)
+        drawn = seen.truth["drawn"]
+        clipped = seen.truth["clipped"]
         tally.at_edge += int((self._on_detector(seen, 0.0) & ~inside).sum())
         tally.not_shown += int((inside & ~drawn).sum())
         tally.clipped += int((inside & drawn & clipped).sum())
-        whole, blended = inside & drawn & ~clipped, self._blended(seen, sky)
+        whole = inside & drawn & ~clipped
+        blended = self._blended(seen, sky)
         tally.blended += int((whole & blended).sum())
         wanted = whole & ~blended
-        found = wanted & (sky.index >= 0) & (shown.index >= 0)
-        listed, both = np.flatnonzero(wanted), np.flatnonzero(found)
+        is_matched = wanted & (sky.index >= 0) & (shown.index >= 0)
+        listed = np.flatnonzero(wanted)
+        both = np.flatnonzero(is_matched)
         for k, star in zip(listed, self._stars(seen, listed, (sky, shown, assumed)), strict=True):
-            (tally.stars if found[k] else tally.lost).append(star)
-        for kind, (there, here) in each.items():
+            (tally.stars if is_matched[k] else tally.lost).append(star)
+        for kind, (there, here) in errors_by_kind.items():
             tally.off_px.setdefault(kind, []).extend(
                 np.hypot(*here.against(there, both)[1:]).tolist()
             )
         if seen.by_channel:
-            tally.out_of_gamut += int((found & ~seen.truth["in_gamut"]).sum())
-            self._compare_channels(seen, np.flatnonzero(found & seen.truth["in_gamut"]))
+            tally.out_of_gamut += int((is_matched & ~seen.truth["in_gamut"]).sum())
+            self._compare_channels(seen, np.flatnonzero(is_matched & seen.truth["in_gamut"]))
         tally.vanished += len(sky.found) - len(shown.found)
         self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)
@@ -433,7 +444,8 @@ class Comparison:
         """All that was measured so far, with what a verdict has to know of the bench. Raises
         InputError (see `true_panel`).
         """
-        bench, name = self.twin.bench, self.twin.config.verify.true_calibration
+        bench = self.twin.bench
+        name = self.twin.config.verify.true_calibration
         return Measured(
             field_count=self.field_count,
             tally=self.tally,
@@ -477,7 +489,8 @@ class Comparison:
         that is as assumed.
         """
         sky, shown, assumed = images
-        rows, places = seen.truth[k], (seen.x_px[k], seen.y_px[k])
+        rows = seen.truth[k]
+        places = (seen.x_px[k], seen.y_px[k])
         codes_mag, *codes_px = assumed.against(sky, k)
         floor_mag, *floor_px = sky.against(self._catalogue(seen), k)
         off = *shown.against(sky, k), codes_mag, np.hypot(*codes_px), floor_mag, np.hypot(*floor_px)
@@ -488,10 +501,8 @@ class Comparison:
 
     def _catalogue(self, seen: TwinField) -> Matched:
         """The catalogue as if it had been found in an image."""
-        flux_e, count = (
-            seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s,
-            len(seen.truth),
-        )
+        flux_e = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s
+        count = len(seen.truth)
         ones = np.ones(count, dtype=np.intp)
         return Matched(
             Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1),
@@ -499,7 +510,8 @@ class Comparison:
         )
 
     def _blended(self, seen: TwinField, sky: Matched) -> npt.NDArray[np.bool_]:
-        flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
+        flux = seen.truth["electrons_per_s"]
+        radius_px = self.finder.settings.radius_px
         by_disc = seen.near_disc(
             self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.psf.width_px)
         )
@@ -516,7 +528,8 @@ class Comparison:
         geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
         match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
         k = np.flatnonzero(wanted & (match >= 0) & ~shared(match))
-        x_px, y_px = seen.x_px[k], seen.y_px[k]
+        x_px = seen.x_px[k]
+        y_px = seen.y_px[k]
         off_px = shown.x_px[match[k]] - x_px, shown.y_px[match[k]] - y_px
         self.tally.displaced.append(np.column_stack([x_px, y_px, *off_px]))
 
@@ -538,19 +551,20 @@ class Comparison:
         if under.noise <= 1 / math.sqrt(12):
             under = noisiest_background(dn)
         windowed = find_stars(dn, self.finder.settings, under)
-        match, true_px = nearest(windowed, seen.x_px, seen.y_px), (seen.x_px, seen.y_px)
+        match = nearest(windowed, seen.x_px, seen.y_px)
+        true_px = (seen.x_px, seen.y_px)
         matched = Matched(windowed, match)
-        found = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
+        placed = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
         tracker = self.twin.config.tracker
         expected_dn = seen.truth["electrons_per_s"] * (
             tracker.exposure_s / tracker.detector.gain_e_per_dn
         )
         k = np.flatnonzero(wanted & (match >= 0))
-        k = k[found.flux[match[k]] > 0]
+        k = k[placed.flux[match[k]] > 0]
         its = match[k]
-        self.tally.noisy_mag += magnitude(found.flux[its] / expected_dn[k]).tolist()
+        self.tally.noisy_mag += magnitude(placed.flux[its] / expected_dn[k]).tolist()
         self.tally.noisy_px += np.hypot(
-            found.x_px[its] - seen.x_px[k], found.y_px[its] - seen.y_px[k]
+            placed.x_px[its] - seen.x_px[k], placed.y_px[its] - seen.y_px[k]
         ).tolist()
 
     def _inside(self, seen: TwinField) -> npt.NDArray[np.bool_]:
@@ -559,7 +573,8 @@ class Comparison:
         bench = self.twin.bench
         reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
         width, height = bench.camera.resolution_px
-        x, y = seen.truth["x_px"], seen.truth["y_px"]
+        x = seen.truth["x_px"]
+        y = seen.truth["y_px"]
         inside = (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach)
         return np.asarray(inside & self._on_detector(seen, margin))
 

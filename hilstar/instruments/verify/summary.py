@@ -44,14 +44,19 @@ def verify(
     attitudes, noise, of_faults = rng.spawn(3)
     with Twin(file) as twin:
         comparison = Comparison(twin)
-        faulty = None if scenario is None else FaultyFields(twin, scenario, of_faults)
+        if scenario is None:
+            faulty = None
+        else:
+            faulty = FaultyFields(twin, scenario, of_faults)
         for number in range(fields):
             q = attitudes.normal(size=4)
             first_frame = int(attitudes.integers(0, MASK_TURNS))
             comparison.add(twin.field(q / np.linalg.norm(q), first_frame), noise)
             on_field(number + 1)
         verdict = judge(comparison.measured())
-        return verdict if faulty is None else replace(verdict, faults=faulty.seen())
+        if faulty is None:
+            return verdict
+        return replace(verdict, faults=faulty.seen())
 
 
 def summarise(verdict: Verdict) -> dict[str, Any]:
@@ -64,10 +69,15 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
     `codes_alone` those of the codes with all else as assumed; `noisy` the same with all of the
     detector's noise.
     """
-    measured, errors = verdict.measured, verdict.errors
-    tally, fit, centroid_px = measured.tally, errors.geometry, errors.centroid_px()
+    measured = verdict.measured
+    errors = verdict.errors
+    tally = measured.tally
+    fit = errors.geometry
+    centroid_px = errors.centroid_px()
     noisy_mag = np.abs(np.array(tally.noisy_mag) - errors.zero_point_mag)
-    noisy_px, glow, calibration = np.array(tally.noisy_px), measured.glow, measured.calibration
+    noisy_px = np.array(tally.noisy_px)
+    glow = measured.glow
+    calibration = measured.calibration
 
     def spread(name: str) -> ErrorSpread:
         return error_spread(np.abs(errors.of(name)))
@@ -134,7 +144,9 @@ def _finite(value: float) -> float | None:
 def _by_magnitude(errors: DisplayErrors) -> list[dict[str, Any]]:
     """The errors of the stars of each whole magnitude."""
     rows = []
-    v_mag, flux, centroid = errors.of("v_mag"), np.abs(errors.of("flux_mag")), errors.centroid_px()
+    v_mag = errors.of("v_mag")
+    flux = np.abs(errors.of("flux_mag"))
+    centroid = errors.centroid_px()
     for low in range(math.floor(v_mag.min(initial=0.0)), math.ceil(v_mag.max(initial=0.0)) + 1):
         there = (v_mag >= low) & (v_mag < low + 1)
         if there.any():
@@ -160,14 +172,14 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{three(summary['centroid_error_px'])} px, {three(summary['centroid_error_arcsec'])}"
         " arcsec"
     )
-    each = ", ".join(
+    error_text = ", ".join(
         f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items()
     )
     return [
         f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}",
         f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)",
         f"{'centroid error':20}{centroid}, by {summary['centroider']}",
-        f"{'by each centroider':20}{each} px rms",
+        f"{'by each centroider':20}{error_text} px rms",
         *(f"{key:21}{three(errors)} mag" for key, errors in summary["channels_mag"].items()),
         *(
             [f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these"]
@@ -215,8 +227,11 @@ def write_report(directory: Path, verdict: Verdict) -> None:
 
 
 def _draw_errors(path: Path, verdict: Verdict) -> None:
-    errors, limits = verdict.errors, verdict.measured.config.verify
-    v_mag, flux, centroid = errors.of("v_mag"), errors.of("flux_mag"), errors.centroid_px()
+    errors = verdict.errors
+    limits = verdict.measured.config.verify
+    v_mag = errors.of("v_mag")
+    flux = errors.of("flux_mag")
+    centroid = errors.centroid_px()
     word = "passes" if verdict.passed else "does not pass"
     finding = (
         f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within"
@@ -251,7 +266,8 @@ def _draw_errors(path: Path, verdict: Verdict) -> None:
 
 def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int]) -> None:
     x, y, dx, dy = (errors.of(name) for name in ("x_px", "y_px", "dx_px", "dy_px"))
-    longest, arrow_px = max(p95(np.hypot(dx, dy)), 1e-9), ARROW_SHARE * resolution_px[0]
+    longest = max(p95(np.hypot(dx, dy)), 1e-9)
+    arrow_px = ARROW_SHARE * resolution_px[0]
     finding = (
         f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are"
         " lost"

@@ -57,10 +57,8 @@ class DisplayErrors:
 def display_errors(measured: Measured) -> DisplayErrors:
     """The errors of all fields' stars."""
     stars = measured.tally.stars
-    zero_point, codes_zero_point = (
-        median([s.flux_mag for s in stars]),
-        median([s.codes_mag for s in stars]),
-    )
+    zero_point = median([s.flux_mag for s in stars])
+    codes_zero_point = median([s.codes_mag for s in stars])
     stars = [
         replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point)
         for s in stars
@@ -73,7 +71,9 @@ def display_errors(measured: Measured) -> DisplayErrors:
 def median(values: list[float]) -> float:
     """The median of the finite values, 0 without any."""
     finite_values = [value for value in values if math.isfinite(value)]
-    return float(np.median(finite_values)) if finite_values else 0.0
+    if finite_values:
+        return float(np.median(finite_values))
+    return 0.0
 
 
 def p95(errors: FloatArray) -> float:
@@ -88,10 +88,16 @@ def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
         return [_none(measured), *too_wide]
     lost = _lost(measured, errors)
     centroid = _centroids(measured, errors)
-    geometry = _geometry(measured, errors) if lost or centroid else []
+    if lost or centroid:
+        geometry = _geometry(measured, errors)
+    else:
+        geometry = []
     # A few stars found by chance, or far from the middle of their windows, say nothing about light.
     mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
-    light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
+    if mostly_lost:
+        light = []
+    else:
+        light = [*_light(measured, errors), *_codes(measured, errors)]
     return [
         *lost,
         *centroid,
@@ -105,7 +111,8 @@ def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 def _none(measured: Measured) -> str:
     """Why no star could be measured: too few in view, or none that can be."""
-    few, fields = measured.stars_a_field, measured.field_count
+    few = measured.stars_a_field
+    fields = measured.field_count
     faintest = measured.config.sky.faintest_v_mag
     text = (
         f"no star could be measured: none of {fields} fields has one that is shown, unclipped and"
@@ -127,7 +134,9 @@ def _too_wide(measured: Measured) -> list[str]:
 
 
 def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
-    lost, looked_for, tally = len(errors.lost), errors.looked_for, measured.tally
+    lost = len(errors.lost)
+    looked_for = errors.looked_for
+    tally = measured.tally
     limit = measured.config.verify.lost_share
     if lost <= limit * looked_for:
         return []
@@ -149,35 +158,45 @@ def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _centroids(measured: Measured, errors: DisplayErrors) -> list[str]:
-    limit, seen = measured.config.verify.centroid_px, p95(errors.centroid_px())
-    return [f"centroids are {seen:.3f} px off at 95 % (limit {limit:g})"] if seen > limit else []
+    limit = measured.config.verify.centroid_px
+    p95_px = p95(errors.centroid_px())
+    if p95_px > limit:
+        return [f"centroids are {p95_px:.3f} px off at 95 % (limit {limit:g})"]
+    return []
 
 
 def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
     """The parts of the geometry that are off by more than the centroid limit somewhere in the
     field.
     """
-    fit, limit = errors.geometry, measured.config.verify.centroid_px
+    fit = errors.geometry
+    limit = measured.config.verify.centroid_px
     if fit is None or fit.left > MAX_LEFT:
         return []
-    reach_px, found, measured_lens = (
-        math.hypot(*measured.camera.resolution_px) / 2,
-        [],
-        measured.config.collimator.geometry,
-    )
+    reach_px = math.hypot(*measured.camera.resolution_px) / 2
+    geometry_fit = []
+    measured_lens = measured.config.collimator.geometry
     again = "its geometry file does not say so; run hilstar calibrate geometric again"
     if abs(fit.scale_error) * reach_px > limit:
-        cure = again if measured_lens else "look at focal_length_mm and pixel_pitch_um"
-        found.append(f"the plate scale is {fit.scale_error:+.2%} off: {cure}")
+        if measured_lens:
+            cure = again
+        else:
+            cure = "look at focal_length_mm and pixel_pitch_um"
+        geometry_fit.append(f"the plate scale is {fit.scale_error:+.2%} off: {cure}")
     if abs(fit.rotation_rad) * reach_px > limit:
         cure = again if measured_lens else "look at q_cam_to_mon"
-        found.append(f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: {cure}")
+        geometry_fit.append(
+            f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: {cure}"
+        )
     if math.hypot(*fit.offset_px) > limit:
         right, down = fit.offset_px
-        cure = again if measured_lens else "look at q_cam_to_mon and principal_point_px"
-        found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
+        if measured_lens:
+            cure = again
+        else:
+            cure = "look at q_cam_to_mon and principal_point_px"
+        geometry_fit.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
     return [
-        *found,
+        *geometry_fit,
         *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it"),
     ]
 
@@ -205,25 +224,27 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
     """Errors of the field's stars relative to each other, then the error that all have in
     common.
     """
-    verify, found = measured.config.verify, []
+    verify = measured.config.verify
+    found = []
     limit = verify.flux_mag
-    seen, alone = p95(np.abs(errors.of("flux_mag"))), p95(np.abs(errors.of("codes_mag")))
-    if seen > limit:
-        response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
+    p95_mag = p95(np.abs(errors.of("flux_mag")))
+    alone = p95(np.abs(errors.of("codes_mag")))
+    if p95_mag > limit:
+        response = math.sqrt(max(p95_mag**2 - alone**2, 0.0)) > limit
         cause = (
             ": light does not follow the codes as assumed, look at the monitor's response and"
             " uniformity"
         )
         found.append(
-            f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}"
+            f"flux is {p95_mag:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}"
         )
-    offset, of_codes = errors.zero_point_mag, errors.codes_zero_point_mag
+    offset = errors.zero_point_mag
+    of_codes = errors.codes_zero_point_mag
     if abs(offset) > limit:
-        cause = (
-            f"the codes alone make {of_codes:+.3f}"
-            if abs(of_codes) > limit
-            else "look at flux_at_white_e_per_s"
-        )
+        if abs(of_codes) > limit:
+            cause = f"the codes alone make {of_codes:+.3f}"
+        else:
+            cause = "look at flux_at_white_e_per_s"
         # A wrong response moves the median star too: then white may well be right.
         if not (found and abs(of_codes) <= limit and verify.true_flux_at_white_e_per_s is None):
             found.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
@@ -246,7 +267,8 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
     above say nothing.
     """
     limits = measured.config.verify
-    mag, px = p95(np.abs(errors.of("floor_mag"))), p95(errors.of("floor_px"))
+    mag = p95(np.abs(errors.of("floor_mag")))
+    px = p95(errors.of("floor_px"))
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     glass = measured.glass
@@ -269,15 +291,21 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
     """The errors of the codes alone, with all else as assumed, and the keys that make codes
     finer.
     """
-    limits, render = measured.config.verify, measured.config.render
-    mag, px = p95(np.abs(errors.of("codes_mag"))), p95(errors.of("codes_px"))
+    limits = measured.config.verify
+    render = measured.config.render
+    mag = p95(np.abs(errors.of("codes_mag")))
+    px = p95(errors.of("codes_px"))
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     # What is proposed has to suit the monitor as it is, too.
-    calibrations = [
-        one for one in (measured.calibration, measured.true_calibration) if one is not None
-    ]
-    ways = [f'quantisation = "{BY_COST[-1]}"'] if render.quantisation != BY_COST[-1] else []
+    calibrations = []
+    for calibration in (measured.calibration, measured.true_calibration):
+        if calibration is not None:
+            calibrations.append(calibration)
+    if render.quantisation != BY_COST[-1]:
+        ways = [f'quantisation = "{BY_COST[-1]}"']
+    else:
+        ways = []
     ways += (
         ["bit_stealing = true"]
         if not render.bit_stealing and all(c.can_steal_bits for c in calibrations)

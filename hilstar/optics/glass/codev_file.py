@@ -118,7 +118,10 @@ class _Surface:
 
     @property
     def label(self) -> str:
-        name = "image" if self.line.keyword == "SI" else f"surface {self.number}"
+        if self.line.keyword == "SI":
+            name = "image"
+        else:
+            name = f"surface {self.number}"
         return f"{name} (line {self.line.number})"
 
     def number_of(self, keyword: str) -> float:
@@ -268,7 +271,10 @@ class _Reader(LensFileReader):
         if line.value() <= 0:
             line.refuse(f"is {line.value():g}", "write a number above 0")
         # CODE V's NA is that of the image's side: 1 / (2 F) for a paraxial pupil in air.
-        f_number = line.value() if line.keyword == "FNO" else 1 / (2 * line.value())
+        if line.keyword == "FNO":
+            f_number = line.value()
+        else:
+            f_number = 1 / (2 * line.value())
         return "f_number", f_number
 
     def _wavelengths(self) -> tuple[tuple[float, ...], int]:
@@ -277,7 +283,10 @@ class _Reader(LensFileReader):
             raise InputError("it has no wavelengths (WL); write those of its light, nm")
         waves = tuple(number / NM_PER_UM for number in line.numbers())
         reference = self.system.get("REF")
-        number = int(reference.value()) - 1 if reference is not None else len(waves) // 2
+        if reference is not None:
+            number = int(reference.value()) - 1
+        else:
+            number = len(waves) // 2
         if not 0 <= number < len(waves):
             which = f"wavelength {number + 1} of {len(waves)}"
             raise InputError(f"REF names {which}; write one that there is")
@@ -307,7 +316,9 @@ class _Reader(LensFileReader):
             yield FieldPoint(at[x_name] * scale, at[y_name] * scale, compression, shift)
 
     def _thickness(self, surface: _Surface) -> float:
-        return surface.line.length(1) if len(surface.line.words) > 1 else 0.0
+        if len(surface.line.words) > 1:
+            return surface.line.length(1)
+        return 0.0
 
     def _curvature_per_mm(self, surface: _Surface) -> float:
         line = surface.line
@@ -406,11 +417,14 @@ class _Reader(LensFileReader):
             return by_code
         # NBK7_SCHOTT: the catalogue stands behind the last underline.
         short, _, catalogue = name.upper().rpartition("_")
-        return Glass(short, (catalogue,)) if short else Glass(name.upper())
+        if short:
+            return Glass(short, (catalogue,))
+        return Glass(name.upper())
 
     def _model(self, surface: _Surface, index: str, abbe: str) -> Glass:
         try:
-            index_d, abbe_d = float(index), float(abbe)
+            index_d = float(index)
+            abbe_d = float(abbe)
         except ValueError:
             surface.line.refuse(
                 f"at {surface.label} has the glass {index}:{abbe}",
@@ -455,7 +469,10 @@ class _Reader(LensFileReader):
                 kind = word.upper()
             elif not word.upper().startswith("L'"):
                 line.refuse(f"at {surface.label} has {shortened(word)}", ADVICE)
-        half_mm = line.value(len(line.words) - 1) * self.mm if line.words else 0.0
+        if line.words:
+            half_mm = line.value(len(line.words) - 1) * self.mm
+        else:
+            half_mm = 0.0
         if half_mm <= 0:
             line.refuse(f"at {surface.label} has no size", "write its half-width")
         return kind, half_mm

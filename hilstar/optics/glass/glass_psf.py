@@ -66,8 +66,10 @@ class NodeSpline:
         # 0.2 s of every command that needs none of it
         from scipy.interpolate import make_interp_spline
 
-        self._nodes, self._of = nodes, None
-        self._middle, self._half = (nodes[-1] + nodes[0]) / 2, (nodes[-1] - nodes[0]) / 2 or 1.0
+        self._nodes = nodes
+        self._of = None
+        self._middle = (nodes[-1] + nodes[0]) / 2
+        self._half = (nodes[-1] - nodes[0]) / 2 or 1.0
         if len(nodes) > max_degree + 1:
             self._of = make_interp_spline(nodes, np.eye(len(nodes)), max_degree)
         else:  # one polynomial, which is quicker
@@ -113,7 +115,10 @@ class Field:
         terms = np.stack(
             [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
         )
-        enough = terms.shape[1] * 1.4 <= len(x) if degree > 1 else terms.shape[1] <= len(x)
+        if degree > 1:
+            enough = terms.shape[1] * 1.4 <= len(x)
+        else:
+            enough = terms.shape[1] <= len(x)
         return bool(enough and np.linalg.matrix_rank(terms, tol=1e-6 * len(x)) == terms.shape[1])
 
     def _corners(self) -> list[int]:
@@ -131,11 +136,12 @@ class Field:
         """
         places = np.stack([x_px, y_px], axis=1)
         beyond_px = np.zeros(len(places))
-        begin, along = self.hull_px, np.roll(self.hull_px, -1, axis=0) - self.hull_px
+        begin = self.hull_px
+        along = np.roll(self.hull_px, -1, axis=0) - self.hull_px
         off = places[:, None] - begin
-        left = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
+        cross_px = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
         outside = np.flatnonzero(
-            (left < -ON_EDGE_PX * self._scale).any(axis=1)
+            (cross_px < -ON_EDGE_PX * self._scale).any(axis=1)
             if len(begin) > 2
             else np.ones(len(places), bool)
         )
@@ -155,13 +161,13 @@ class Field:
 
         kernels: tuple[Kernel, ...] = "linear", "thin_plate_spline", "quintic", "quintic"
         kernel = kernels[self._degree]
-        found: Callable[[FloatArray], FloatArray] = RBFInterpolator(
+        interpolator: Callable[[FloatArray], FloatArray] = RBFInterpolator(
             self._scaled(self.places_px),
             np.eye(len(self.places_px)),
             kernel=kernel,
             degree=self._degree,
         )
-        return found
+        return interpolator
 
     def __call__(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The functions (n, F) at places (n,)."""
@@ -233,7 +239,8 @@ class GlassPsf(SampledPsf):
     def __post_init__(self) -> None:
         """Refuse what is no PSF, the mean and each of the others."""
         super().__post_init__()
-        stamps, weights = self._stamps, self.optics.weights.reshape(-1, len(self.optics.basis))
+        stamps = self._stamps
+        weights = self.optics.weights.reshape(-1, len(self.optics.basis))
         least = float((weights @ stamps.light).min())
         if least < 1 - MAX_UNEVEN:
             raise InputError(
@@ -248,10 +255,9 @@ class GlassPsf(SampledPsf):
         flat = self.optics.weights.reshape(-1, len(self.optics.basis))
         peak = (flat @ self.optics.basis.reshape(len(self.optics.basis), -1)).max(axis=1)
         sharpest = np.tensordot(flat[peak.argmax()], self.optics.basis, axes=1).clip(min=0)
-        widths = [
-            _Measured(samples, self.per_px, self.pixel_integrated).width_px
-            for samples in (self.samples, sharpest)
-        ]
+        widths = []
+        for samples in (self.samples, sharpest):
+            widths.append(_Measured(samples, self.per_px, self.pixel_integrated).width_px)
         x, y = np.min(widths, axis=0).tolist()
         return x, y
 
@@ -296,22 +302,24 @@ class GlassPsf(SampledPsf):
         side = self.footprint_px
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
         shape = self.optics.basis.shape[1:]
-        found = (
+        basis_pixels = (
             _pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated) for size in shape
         )
-        return [part.reshape(steps + 1, side, -1) for part in found]
+        return [part.reshape(steps + 1, side, -1) for part in basis_pixels]
 
     @cached_property
     def _squares(self) -> int:
         """How many squares a pixel has along each side."""
-        basis, weights = self.optics.basis, self.optics.weights.reshape(-1, len(self.optics.basis))
+        basis = self.optics.basis
+        weights = self.optics.weights.reshape(-1, len(self.optics.basis))
         lines = (weights @ basis.sum(axis=axis) for axis in (2, 1))
-        each = [
-            line @ np.diff(table, 3, axis=0).swapaxes(1, 2)
-            for line, table in zip(lines, self._tabulated(PLACES_A_PX), strict=True)
-        ]
+        curvatures = []
+        for line, table in zip(lines, self._tabulated(PLACES_A_PX), strict=True):
+            curvatures.append(line @ np.diff(table, 3, axis=0).swapaxes(1, 2))
         # over a square of 1 px, by Chebyshev's
-        cubic = max(float(np.abs(one).max()) for one in each) * PLACES_A_PX**3 / 192
+        cubic = (
+            max(float(np.abs(curvature).max()) for curvature in curvatures) * PLACES_A_PX**3 / 192
+        )
         return int(np.clip(math.ceil(np.cbrt(cubic / CUBIC_TOLERANCE)), MIN_SQUARES, MAX_SQUARES))
 
     @cached_property
@@ -319,11 +327,13 @@ class GlassPsf(SampledPsf):
         """The basis as pixels get it, tabulated by a star's place in its middle pixel and
         reduced to few stamps.
         """
-        side, squares = self.footprint_px, self._squares
+        side = self.footprint_px
+        squares = self._squares
         steps_a_square = min(
             MAX_STEPS, max(MIN_STEPS, min(TABLE_SIDE // side, MAX_STEPS * 6) // squares)
         )
-        steps, count = steps_a_square * squares, len(self.optics.basis)
+        steps = steps_a_square * squares
+        count = len(self.optics.basis)
         down, across = (
             _normal_floats(part.reshape(-1, part.shape[2])) for part in self._tabulated(steps)
         )
@@ -331,9 +341,11 @@ class GlassPsf(SampledPsf):
             np.float32
         )
         table = np.empty((count, (steps + 1) ** 2, side * side), dtype=np.float32)
-        for image, scale, own in zip(_normal_floats(self.optics.basis), used, table, strict=True):
+        for image, scale, table_part in zip(
+            _normal_floats(self.optics.basis), used, table, strict=True
+        ):
             pixels = (down @ (scale * image) @ across.T).reshape(steps + 1, side, steps + 1, side)
-            own[:] = pixels.transpose(0, 2, 1, 3).reshape(own.shape)
+            table_part[:] = pixels.transpose(0, 2, 1, 3).reshape(table_part.shape)
         stamps, coefficients = _few(table.reshape(-1, side * side), side)
         by_place = (coefficients.reshape(count, -1) / used[:, None]).reshape(
             count, steps + 1, steps + 1, -1
@@ -342,12 +354,12 @@ class GlassPsf(SampledPsf):
         y, x = (part.ravel() for part in np.meshgrid(places, places, indexing="ij"))
         fit = np.linalg.pinv(_terms(x, y)).astype(np.float32)
         parts = np.empty((squares**2, fit.shape[0], count, len(stamps)), dtype=np.float32)
-        for number, own in enumerate(parts):
+        for number, table_part in enumerate(parts):
             row, column = (steps_a_square * place for place in divmod(number, squares))
             square = by_place[
                 :, row : row + steps_a_square + 1, column : column + steps_a_square + 1
             ]
-            own[:] = np.tensordot(fit, square.reshape(count, -1, len(stamps)), axes=(1, 1))
+            table_part[:] = np.tensordot(fit, square.reshape(count, -1, len(stamps)), axes=(1, 1))
         light = table.sum(axis=2) / used[:, None]
         return _Stamps(
             stamps, parts.reshape(squares**2, -1, len(stamps)), stamps.sum(axis=1), light
@@ -357,10 +369,8 @@ class GlassPsf(SampledPsf):
         """How much stars at places (n,) have of each basis image (n, K); `shares` as
         spectra of `Psf`.
         """
-        by_field, shares = (
-            self.field(x_px, y_px).T.astype(np.float32),
-            shares.T.astype(np.float32, order="C"),
-        )
+        by_field = self.field(x_px, y_px).T.astype(np.float32)
+        shares = shares.T.astype(np.float32, order="C")
         by_point = by_field[:, None] * shares.reshape(shares.shape[0], -1)
         return np.asarray(by_point.reshape(len(self._light), -1).T @ self._light)
 
@@ -374,30 +384,34 @@ class GlassPsf(SampledPsf):
         illumination inside the image.
         """
         optics = self.optics
-        found = optics.weights * (optics.illumination * optics.inside)[..., None]
-        return np.asarray(found.reshape(-1, len(optics.basis)), dtype=np.float32)
+        light = optics.weights * (optics.illumination * optics.inside)[..., None]
+        return np.asarray(light.reshape(-1, len(optics.basis)), dtype=np.float32)
 
     def _parts(self, weights: Float32Array, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
         """What stars at places (n,), by square, that have `weights` (n, K) of the basis images
         have of each stamp (n, R).
         """
         square, *within = _square(x_px, y_px, self._squares)
-        terms, found = _terms(*within).astype(np.float32)[:, :, None], self._stamps.parts
+        terms = _terms(*within).astype(np.float32)[:, :, None]
+        stamp_parts = self._stamps.parts
         counts = np.bincount(square, minlength=self._squares**2)
-        parts = np.empty((len(terms), found.shape[2]), dtype=np.float32)
-        room, end = np.empty((counts.max(), terms.shape[1], weights.shape[1]), dtype=np.float32), 0
-        for own, count in zip(found, counts.tolist(), strict=True):
+        parts = np.empty((len(terms), stamp_parts.shape[2]), dtype=np.float32)
+        room = np.empty((counts.max(), terms.shape[1], weights.shape[1]), dtype=np.float32)
+        end = 0
+        for stamp_part, count in zip(stamp_parts, counts.tolist(), strict=True):
             if count:
-                begin, end = end, end + count
-                each = np.multiply(terms[begin:end], weights[begin:end, None], out=room[:count])
-                np.matmul(each.reshape(count, -1), own, out=parts[begin:end])
+                begin = end
+                end = end + count
+                products = np.multiply(terms[begin:end], weights[begin:end, None], out=room[:count])
+                np.matmul(products.reshape(count, -1), stamp_part, out=parts[begin:end])
         return parts
 
     @cached_property
     def moved_px(self) -> FloatArray:
         """The centroid of each PSF from its chief ray (F, L, 2), px."""
         _, height, width = self.optics.basis.shape
-        x, y = np.arange(width) - width // 2, np.arange(height) - height // 2
+        x = np.arange(width) - width // 2
+        y = np.arange(height) - height // 2
         firsts = np.stack(
             [self.optics.basis.sum(axis=1) @ x, self.optics.basis.sum(axis=2) @ y], axis=1
         )
@@ -411,7 +425,8 @@ class GlassPsf(SampledPsf):
 
         What lies outside the images does not count.
         """
-        optics, by_field = self.optics, self.field(x_px, y_px)
+        optics = self.optics
+        by_field = self.field(x_px, y_px)
         falls = optics.illumination * optics.inside
         total = ((by_field @ falls) * spectra).sum(axis=1)
         lit = total > DARK
@@ -451,7 +466,8 @@ class GlassPsf(SampledPsf):
         weights = self._mixed(x_px, y_px, shares)
         parts = self._parts(weights, x_px, y_px)
         # Polynomials and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
-        light, whole = weights @ self._sums, parts @ self._stamps.sums
+        light = weights @ self._sums
+        whole = parts @ self._stamps.sums
         return parts @ self._stamps.stamps, np.asarray(
             light / np.where(whole > 0, whole, np.inf), dtype=np.float32
         )
@@ -462,9 +478,9 @@ class GlassPsf(SampledPsf):
         """
         side = self.footprint_px
         at_px = np.arange(side) - side // 2
-        found = np.empty((len(x_px), side, side))
-        for own, weights, x, y in zip(
-            found, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True
+        stamps = np.empty((len(x_px), side, side))
+        for stamp, weights, x, y in zip(
+            stamps, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True
         ):
             image = np.tensordot(weights.astype(np.float64), self.optics.basis, axes=1)
             down, across = (
@@ -476,8 +492,8 @@ class GlassPsf(SampledPsf):
                 )
                 for size, place in zip(image.shape, (y, x), strict=True)
             )
-            own[:] = down @ image @ across.T
-        return found
+            stamp[:] = down @ image @ across.T
+        return stamps
 
     def image(
         self,
@@ -493,15 +509,12 @@ class GlassPsf(SampledPsf):
 
         side, (width, height) = self.footprint_px, resolution_px
         across = width + 2 * side
-        size, near = (height + 2 * side) * across, np.arange(side, dtype=np.int32)
-        near, at_once = (
-            (near[:, None] * across + near).ravel(),
-            max(1, SPRITES_AT_ONCE_PX // side**2),
-        )
-        order, room = (
-            np.argsort(_square(x_px, y_px, self._squares)[0]),
-            np.empty(0, np.float32),
-        )
+        size = (height + 2 * side) * across
+        near = np.arange(side, dtype=np.int32)
+        near = (near[:, None] * across + near).ravel()
+        at_once = max(1, SPRITES_AT_ONCE_PX // side**2)
+        order = np.argsort(_square(x_px, y_px, self._squares)[0])
+        room = np.empty(0, np.float32)
         for begin in range(0, max(len(order), 1), at_once):
             part = order[begin : begin + at_once]
             at_px = x_px[part], y_px[part]
@@ -509,10 +522,8 @@ class GlassPsf(SampledPsf):
             columns, rows = (
                 np.floor(place + 0.5).astype(np.int32) + side - side // 2 for place in at_px
             )
-            places, ends = (
-                (rows * across + columns)[:, None] + near,
-                np.arange(len(part) + 1, dtype=np.int32) * side**2,
-            )
+            places = (rows * across + columns)[:, None] + near
+            ends = np.arange(len(part) + 1, dtype=np.int32) * side**2
             sparse = csc_array((stamps.ravel(), places.ravel(), ends), (size, len(part)))
             light = np.asarray(sparse @ (electrons_per_s[part] * scale))
             room = room + light if begin else light
@@ -618,18 +629,18 @@ def with_components(psf: GlassPsf, count: int) -> GlassPsf:
     Each PSF still sums to 1.
     """
     optics = psf.optics
-    flat, basis = (
-        optics.weights.reshape(-1, len(optics.basis)),
-        optics.basis.reshape(len(optics.basis), -1),
-    )
+    flat = optics.weights.reshape(-1, len(optics.basis))
+    basis = optics.basis.reshape(len(optics.basis), -1)
     mean = flat.mean(axis=0)
     values, vectors = np.linalg.eigh(basis @ basis.T)
     # its square is the metric of weights
     scale = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
     turned, sizes, components = np.linalg.svd((flat - mean) @ scale, full_matrices=False)
-    kept = min(count - 1, int((sizes > 1e-9 * sizes[0]).sum()))
-    images = np.vstack([mean, components[:kept] @ np.linalg.pinv(scale)]) @ basis
-    weights = np.hstack([np.ones((len(flat), 1)), turned[:, :kept] * sizes[:kept]])
+    component_count = min(count - 1, int((sizes > 1e-9 * sizes[0]).sum()))
+    images = np.vstack([mean, components[:component_count] @ np.linalg.pinv(scale)]) @ basis
+    weights = np.hstack(
+        [np.ones((len(flat), 1)), turned[:, :component_count] * sizes[:component_count]]
+    )
     return _of_images(psf, images, weights)
 
 
@@ -637,7 +648,8 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     """A glass whose PSFs are Gaussians, each of its own axes and angle: the centroids, and
     widths by adaptive moments.
     """
-    optics, side = psf.optics, psf.footprint_px
+    optics = psf.optics
+    side = psf.footprint_px
     pixel = np.stack([part.ravel() for part in np.indices((side, side))[::-1]], axis=1) - side // 2
     _, height, width = optics.basis.shape
     y, x = np.indices((height, width))
@@ -646,7 +658,8 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     for stamp, centroid in zip(
         psf._centred().astype(np.float64), psf.moved_px.reshape(-1, 2), strict=True
     ):
-        off, spread = pixel - centroid, np.eye(2)
+        off = pixel - centroid
+        spread = np.eye(2)
         for _ in range(WIDTH_ROUNDS):  # as `SampledPsf.width_px`
             light = stamp * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off))
             spread = 2 * (off.T * light) @ off / light.sum()
@@ -657,10 +670,10 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
             spread = spread - np.eye(2) * PIXEL_VARIANCE
         off = place - centroid
         images.append(np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)))
-    found = np.stack(images)
-    found /= found.sum(axis=1, keepdims=True)
+    gaussians = np.stack(images)
+    gaussians /= gaussians.sum(axis=1, keepdims=True)
     basis, weights, _ = principal(
-        found, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px
+        gaussians, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px
     )
     return _of_images(psf, basis.astype(np.float64), weights)
 
@@ -684,13 +697,13 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
     from scipy.ndimage import shift
 
     room = math.ceil(float(np.abs(lateral).max()))
-    flat, moves = optics.weights.reshape(-1, len(optics.basis)), lateral.reshape(-1, 2)
+    flat = optics.weights.reshape(-1, len(optics.basis))
+    moves = lateral.reshape(-1, 2)
     padded = np.pad(optics.basis, ((0, 0), (room, room), (room, room)))
     unmoved = (np.tensordot(weight, padded, axes=1) for weight in flat)
-    moved = [
-        shift(image, move[::-1], order=5) if move.any() else image
-        for image, move in zip(unmoved, moves, strict=True)
-    ]
+    moved = []
+    for image, move in zip(unmoved, moves, strict=True):
+        moved.append(shift(image, move[::-1], order=5) if move.any() else image)
     images = np.stack(moved)
     images /= images.sum(axis=(1, 2), keepdims=True)
     basis, weights, _ = principal(
@@ -726,9 +739,10 @@ def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> F
     """
     from scipy.interpolate import make_interp_spline
 
-    each = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
-    place_px = (np.arange(len(each)) - len(each) // 2) / per_px
-    spline, last_px = make_interp_spline(place_px, each, SPLINE_DEGREE), place_px[-1]
+    unit_images = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
+    place_px = (np.arange(len(unit_images)) - len(unit_images) // 2) / per_px
+    spline = make_interp_spline(place_px, unit_images, SPLINE_DEGREE)
+    last_px = place_px[-1]
     if integrated:
         return np.asarray(spline(np.clip(at_px, -last_px, last_px)) * per_px)
     light = spline.antiderivative()
@@ -753,18 +767,19 @@ def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
     carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
     moments = table @ terms
     rest = table - moments @ carriers
-    rng, total = (
-        np.random.default_rng(0),
-        float(np.einsum("ij,ij->", table, table, dtype=np.float64)),
-    )
-    wanted, left = FIRST_STAMPS, float(np.einsum("ij,ij->", rest, rest, dtype=np.float64))
+    rng = np.random.default_rng(0)
+    total = float(np.einsum("ij,ij->", table, table, dtype=np.float64))
+    wanted = FIRST_STAMPS
+    rest_energy = float(np.einsum("ij,ij->", rest, rest, dtype=np.float64))
     while True:
         wanted = min(wanted, *rest.shape)
         random = rng.standard_normal((rest.shape[1], wanted), dtype=np.float32)
         span = _orthonormal(rest.T @ _orthonormal(rest @ random))
         held = (rest @ span).astype(np.float64)
-        found, turn = np.linalg.eigh(held.T @ held)
-        enough = np.flatnonzero(left - np.cumsum(found[::-1]) <= STAMP_TOLERANCE**2 * total)
+        eigenvalues, turn = np.linalg.eigh(held.T @ held)
+        enough = np.flatnonzero(
+            rest_energy - np.cumsum(eigenvalues[::-1]) <= STAMP_TOLERANCE**2 * total
+        )
         if len(enough) or wanted in (MAX_STAMPS, *rest.shape):
             turn = turn[:, ::-1][:, : int(enough[0]) + 1 if len(enough) else wanted].astype(
                 np.float32

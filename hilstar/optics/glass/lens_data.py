@@ -227,7 +227,10 @@ class LensSurface:
     @property
     def paraxial_curvature_per_mm(self) -> float:
         """The curvature at the vertex: a term in r^2 bends, too."""
-        second = self.polynomial[1] if len(self.polynomial) > 1 else 0.0
+        if len(self.polynomial) > 1:
+            second = self.polynomial[1]
+        else:
+            second = 0.0
         return self.curvature_per_mm + 2 * second
 
 

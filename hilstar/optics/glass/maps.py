@@ -47,16 +47,16 @@ def _images(path: Path) -> FloatArray:
     content = read_bytes(path, STACK_ADVICE, MAX_FILE_BYTES)
     try:
         with opened_fits(content) as hdus:
-            found: FloatArray = np.asarray(hdus[0].data, dtype=np.float64)
+            images: FloatArray = np.asarray(hdus[0].data, dtype=np.float64)
     except ImageSizeError as error:
         raise InputError(f"{path}: {error}; {STACK_ADVICE}") from error
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {STACK_ADVICE}") from error
-    if found.ndim == 2:
-        found = found[None]
-    if found.ndim != 3:
-        raise InputError(f"{path}: an array of {found.ndim} axes; {STACK_ADVICE}")
-    return found
+    if images.ndim == 2:
+        images = images[None]
+    if images.ndim != 3:
+        raise InputError(f"{path}: an array of {images.ndim} axes; {STACK_ADVICE}")
+    return images
 
 
 def _points(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -64,7 +64,8 @@ def _points(path: Path) -> tuple[FloatArray, FloatArray]:
     or cell is not known.
     """
     more = (*AXES[2:], *FACTS)
-    rows, defaults = [], [np.nan, 0.0, *facts_of(1)[0]]
+    rows = []
+    defaults = [np.nan, 0.0, *facts_of(1)[0]]
     for line, cells in read_rows(path, AXES[:2], POINTS_ADVICE, MAX_CSV_BYTES, more):
         named = [(name, cell) for name, cell in zip(more, cells[2:], strict=True) if cell]
         place = finite_numbers(path, line, AXES[:2], cells[:2], POINTS_ADVICE)

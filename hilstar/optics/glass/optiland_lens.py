@@ -243,7 +243,9 @@ def find_glass(glass: Glass, label: str) -> tuple[GlassFile, list[str]]:
 
 
 def _where(glass: Glass) -> str:
-    return f" (the file names {', '.join(glass.catalogues)})" if glass.catalogues else ""
+    if glass.catalogues:
+        return f" (the file names {', '.join(glass.catalogues)})"
+    return ""
 
 
 def _instead(written: str, plain: str) -> str:
@@ -259,7 +261,9 @@ def _instead(written: str, plain: str) -> str:
 
 def _place_in_order(file: GlassFile) -> int:
     known = file.catalogue in CATALOGUE_ORDER
-    return CATALOGUE_ORDER.index(file.catalogue) if known else len(CATALOGUE_ORDER)
+    if known:
+        return CATALOGUE_ORDER.index(file.catalogue)
+    return len(CATALOGUE_ORDER)
 
 
 def _plain(name: str) -> str:

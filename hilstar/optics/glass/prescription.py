@@ -128,7 +128,10 @@ def _read(path: Path) -> "_Lens":
         raise MachineError(f"hilstar optics lens needs optiland: {CAN_INSTALL}") from error
     try:
         with _quiet() as warned:
-            lens = _optiland_s_own(path) if prescription is None else _of_prescription(prescription)
+            if prescription is None:
+                lens = _optiland_s_own(path)
+            else:
+                lens = _of_prescription(prescription)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # optiland raises whatever a broken file causes in its layers
@@ -241,7 +244,8 @@ class _LensRays:
         self._image_mm, self._to_image = (
             np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform()
         )
-        self.centre_mm, self.sign = np.zeros(2), 1.0
+        self.centre_mm = np.zeros(2)
+        self.sign = 1.0
         edge = np.array([[0.0, 0.0], [0.0, EDGE]])
         tangents, places = self.chiefs(edge, self.primary_um)
         if not np.isfinite(places).all():
@@ -314,7 +318,8 @@ class _LensRays:
         # beyond it only where no light is
         px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)
         py = np.clip(down + moved_along * turn[1] + moved_beside * turn[0], -1, 1)
-        hx, hy = np.full(px.size, field[0]), np.full(px.size, field[1])
+        hx = np.full(px.size, field[0])
+        hy = np.full(px.size, field[1])
         generate = self.optic.ray_tracer.ray_generator.generate_rays
         first = generate(hx, hy, px.ravel(), py.ravel(), um)
         x0, y0, z0, l0, m0, n0 = (
@@ -388,7 +393,9 @@ def _glass(
     finest_um = lens.wavelengths_um[0] * lens.f_number / 2
     samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(plate.pitch_um / finest_um)))
     grid = 2 * plate.half_px * samples + 1, pitch_mm / samples
-    images, at, facts = [], [], []
+    images = []
+    at = []
+    facts = []
     axis_light: dict[float, float] = {}
     for um in lens.wavelengths_um:
         axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
@@ -405,7 +412,8 @@ def _glass(
                         lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid
                     )
                 else:
-                    image, outside = _dark(grid[0]), 0.0
+                    image = _dark(grid[0])
+                    outside = 0.0
                 images.append(image)
                 at.append((*(middle + place), um * 1e3, focus_um))
                 moved = (chief + slopes * focus_um * 1e-3) / pitch_mm - place
@@ -486,7 +494,10 @@ def _waves(
         rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
     )
     path = path[lit] - np.median(path[lit])
-    light, angle, cos_x, cos_y = rays.light[lit], angle[lit], cos_x[lit], cos_y[lit]
+    light = rays.light[lit]
+    angle = angle[lit]
+    cos_x = cos_x[lit]
+    cos_y = cos_y[lit]
     part = np.sqrt(light * angle) * np.exp(1j * wave * path)
     # a phase that no light shows
     middle_x, middle_y = (np.average(cosine, weights=light) for cosine in (cos_x, cos_y))
@@ -512,10 +523,11 @@ def _counted(
     lit = rays.light > 0
     light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
     x, y = (
-        (place[lit] + cosine / cos_z * defocus_mm - own) / step_mm + side // 2
-        for place, cosine, own in ((rays.x, cos_x, centre[0]), (rays.y, cos_y, centre[1]))
+        (place[lit] + cosine / cos_z * defocus_mm - centre_px) / step_mm + side // 2
+        for place, cosine, centre_px in ((rays.x, cos_x, centre[0]), (rays.y, cos_y, centre[1]))
     )
-    column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    column = np.floor(x).astype(np.intp)
+    row = np.floor(y).astype(np.intp)
     image = np.zeros((side, side))
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = light * np.abs(1 - down - (y - row)) * np.abs(1 - right - (x - column))
@@ -540,7 +552,10 @@ class _Chiefs:
 
     def places_mm(self, tangents: FloatArray) -> FloatArray:
         """Where it has directions (n, 2)."""
-        bent = tangents if self.lens is None else np.stack(self.lens.bent(*tangents.T), axis=1)
+        if self.lens is None:
+            bent = tangents
+        else:
+            bent = np.stack(self.lens.bent(*tangents.T), axis=1)
         return np.asarray(self.focal_length_mm * bent)
 
     @classmethod
@@ -562,10 +577,10 @@ class _Chiefs:
             np.concatenate(part)
             for part in ((2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v))
         ]
-        found = np.linalg.lstsq(np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None)[
-            0
-        ].tolist()
-        focal, *bent = found
+        coefficients = np.linalg.lstsq(
+            np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None
+        )[0].tolist()
+        focal, *bent = coefficients
         k1, k2, k3, p1, p2 = (
             part / focal / largest**power for part, power in zip(bent, (2, 4, 6, 1, 1), strict=True)
         )

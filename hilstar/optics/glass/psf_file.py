@@ -119,11 +119,13 @@ def glass_of(
     """The glass of a stack, whose images need not be normalised. Raises InputError for one that
     is not of PSFs.
     """
-    images, count, per_px = stack.images, len(stack.images), stack.per_px
+    images = stack.images
+    count = len(stack.images)
+    per_px = stack.per_px
     if images.ndim != 3 or not all(side % 2 for side in images.shape[1:]):
-        found = " x ".join(map(str, images.shape[::-1]))
+        shape_text = " x ".join(map(str, images.shape[::-1]))
         raise InputError(
-            f"a stack of {found} has no middle samples; write images (n, height, width) of odd"
+            f"a stack of {shape_text} has no middle samples; write images (n, height, width) of odd"
             " sides"
         )
     if not 1 <= count <= MAX_IMAGES:
@@ -199,7 +201,8 @@ def principal(
     rest = images - moments @ carriers
     in_pixels = _by_pixels(rest.reshape(-1, *shape), width)
     values, vectors = np.linalg.eigh(in_pixels @ in_pixels.T)
-    residual, count = 1.0, 0
+    residual = 1.0
+    count = 0
     for count in range(len(images) + 1):
         residual = _elsewhere(in_pixels)
         if (
@@ -210,12 +213,12 @@ def principal(
             break
         vector = vectors[:, -1 - count]
         in_pixels -= np.outer(vector, vector @ in_pixels)
-    own = vectors[:, ::-1][:, :count]
-    basis = own.T @ rest
+    leading = vectors[:, ::-1][:, :count]
+    basis = leading.T @ rest
     size = np.maximum(np.linalg.norm(basis, axis=1), 1e-300)
     return (
         np.concatenate([carriers, basis / size[:, None]]).astype(np.float32),
-        np.hstack([moments, own * size]),
+        np.hstack([moments, leading * size]),
         residual,
     )
 
@@ -228,15 +231,15 @@ def _by_pixels(images: FloatArray, width: int) -> FloatArray:
     to its mean light.
     """
     apart = max(1, round(width / PHASES))
-    found = images
+    pixel_sums = images
     for axis in (1, 2):
         summed = np.cumsum(
-            np.pad(found, [(width, width - 1) if k == axis else (0, 0) for k in range(3)]),
+            np.pad(pixel_sums, [(width, width - 1) if k == axis else (0, 0) for k in range(3)]),
             axis=axis,
         )
         last = np.arange(width, summed.shape[axis], apart)
-        found = summed.take(last, axis) - summed.take(last - width, axis)
-    return np.asarray(found.reshape(len(images), -1) * (apart / width) ** 2)
+        pixel_sums = summed.take(last, axis) - summed.take(last - width, axis)
+    return np.asarray(pixel_sums.reshape(len(images), -1) * (apart / width) ** 2)
 
 
 def _elsewhere(residuals: FloatArray) -> float:
@@ -277,9 +280,9 @@ def _product(
 
 
 def _ordered(values: FloatArray, place: tuple[IntArray, ...], shape: tuple[int, ...]) -> FloatArray:
-    found = np.empty((*shape, *values.shape[1:]))
-    found[place] = values
-    return found
+    grid = np.empty((*shape, *values.shape[1:]))
+    grid[place] = values
+    return grid
 
 
 def _check(glass: Glass) -> None:
@@ -316,7 +319,8 @@ def _check_numbers(glass: Glass) -> None:
 def _check_psfs(glass: Glass) -> None:
     binned = [_binned(image, glass.per_px) for image in glass.basis]
     _, height, width = glass.basis.shape
-    x, y = np.arange(width) - width // 2, np.arange(height) - height // 2
+    x = np.arange(width) - width // 2
+    y = np.arange(height) - height // 2
     firsts = np.stack(
         [glass.basis.sum(axis=(1, 2)), (glass.basis.sum(axis=1) @ x), glass.basis.sum(axis=2) @ y],
         axis=1,
@@ -407,7 +411,9 @@ def _glass_in(path: Path, content: bytes) -> Glass | None:
     """The glass in a file's bytes; None where they are an image or no FITS file."""
     try:
         with opened_fits(content) as hdus:
-            return _checked_glass(path, hdus) if POINTS in hdus else None
+            if POINTS in hdus:
+                return _checked_glass(path, hdus)
+            return None
     except InputError:
         raise
     except Exception:
@@ -417,8 +423,8 @@ def _glass_in(path: Path, content: bytes) -> Glass | None:
 
 def _checked_glass(path: Path, hdus: "fits.HDUList") -> Glass:
     try:
-        found = _parsed(hdus)
-        _check(found)
+        stack = _parsed(hdus)
+        _check(stack)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:
@@ -426,12 +432,15 @@ def _checked_glass(path: Path, hdus: "fits.HDUList") -> Glass:
             f"{path}: its tables cannot be read ({type(error).__name__}); make it with `hilstar"
             " optics`"
         ) from error
-    return found
+    return stack
 
 
 def _parsed(hdus: "fits.HDUList") -> Glass:
-    header, basis, table = hdus[0].header, hdus[0].data, hdus[POINTS].data
-    per_px, integrated = header.get("OVERSAMP", 1), header.get("PIXINT", False)
+    header = hdus[0].header
+    basis = hdus[0].data
+    table = hdus[POINTS].data
+    per_px = header.get("OVERSAMP", 1)
+    integrated = header.get("PIXINT", False)
     if header.get("PSFVERS") != VERSION:
         raise InputError(
             f"PSFVERS is {header.get('PSFVERS')!r}, and this hilstar reads {VERSION}; make it with"
@@ -461,7 +470,10 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
     shape = tuple(len(axis) for axis in axes)
     numbers: list[Any] = [header.get(key, 0.0) for key in LENS_KEYS]
     k1, k2, k3, p1, p2 = numbers
-    lens = Lens((k1, k2, k3), (p1, p2)) if any(numbers) else None
+    if any(numbers):
+        lens = Lens((k1, k2, k3), (p1, p2))
+    else:
+        lens = None
     transmission = None
     if TRANSMISSION in hdus:
         curve = [

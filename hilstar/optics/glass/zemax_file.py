@@ -158,7 +158,9 @@ class _Surface:
     @property
     def kind(self) -> str:
         line = self.values.get("TYPE")
-        return "STANDARD" if line is None else " ".join(line.words).upper()
+        if line is None:
+            return "STANDARD"
+        return " ".join(line.words).upper()
 
     def number_of(self, keyword: str) -> float:
         line = self.values.get(keyword)
@@ -281,7 +283,8 @@ class _Reader(LensFileReader):
             mode.refuse(f"is {' '.join(mode.words) or 'empty'}: no sequential lens", CAN_WRITE)
         air = self.head.get("ENVD")
         if air is not None and len(air.words) > 2 and air.value(2):
-            at_c, at_atm = air.value(0), air.value(1)
+            at_c = air.value(0)
+            at_atm = air.value(1)
             if (at_c, at_atm) != (STANDARD_C, STANDARD_ATM):
                 air.refuse(
                     f"adjusts indices to {at_c:g} C and {at_atm:g} atm",
@@ -351,7 +354,10 @@ class _Reader(LensFileReader):
     def _count(self, place: int, known: int) -> int:
         """How many of a list count, by FTYP; the list may have room for more."""
         line = self._field_type()
-        stated = int(line.value(place)) if line is not None and len(line.words) > place else 0
+        if line is not None and len(line.words) > place:
+            stated = int(line.value(place))
+        else:
+            stated = 0
         return min(stated, known) if stated > 0 else known
 
     def _list(self, new_name: str, old_name: str) -> tuple[float, ...]:
@@ -366,7 +372,8 @@ class _Reader(LensFileReader):
         for number in range(self._count(2, longest)):
             x, y, *vignetting = (nth(values, number) for values in lists.values())
             compression_x, compression_y, shift_x, shift_y = vignetting
-            compression, shift = (compression_x, compression_y), (shift_x, shift_y)
+            compression = (compression_x, compression_y)
+            shift = (shift_x, shift_y)
             yield FieldPoint(x * scale, y * scale, compression, shift)
 
     def _wavelengths(self) -> tuple[tuple[float, ...], int]:
@@ -374,7 +381,10 @@ class _Reader(LensFileReader):
         every = every or self._list("WAVL", "WAVL")
         count = self._count(3, len(every))
         primary = self.head.get("PWAV")
-        number = int(primary.value()) - 1 if primary is not None else 0
+        if primary is not None:
+            number = int(primary.value()) - 1
+        else:
+            number = 0
         if not 0 <= number < max(count, 1):
             which = f"wavelength {number + 1} of {count}"
             raise InputError(f"PWAV names {which}; write one that there is")
@@ -402,7 +412,8 @@ class _Reader(LensFileReader):
         _refuse_parameters(surface, BREAK_STEPS)
         if "STOP" in surface.values:
             surface.values["STOP"].refuse("is at a COORDBRK", "put it on the surface beside it")
-        x_mm, y_mm = surface.parameter(1) * self.mm, surface.parameter(2) * self.mm
+        x_mm = surface.parameter(1) * self.mm
+        y_mm = surface.parameter(2) * self.mm
         turns_deg = [surface.parameter(number) for number in (3, 4, 5)]
         if surface.parameter(6):
             frame.rotate(Rotation.from_euler("ZYX", turns_deg[::-1], degrees=True).as_matrix())
@@ -435,7 +446,9 @@ class _Reader(LensFileReader):
         )
 
     def _paraxial_focal_mm(self, surface: _Surface) -> float | None:
-        return surface.parameter(1) * self.mm if surface.kind == "PARAXIAL" else None
+        if surface.kind == "PARAXIAL":
+            return surface.parameter(1) * self.mm
+        return None
 
     def _glass(self, surface: _Surface) -> Glass:
         line = surface.values.get("GLAS")
@@ -470,7 +483,8 @@ class _Reader(LensFileReader):
         if moved is not None:
             centre = moved.value(0) * self.mm, moved.value(1) * self.mm
         for line in surface.apertures:
-            first, second = line.value(0) * self.mm, line.value(1) * self.mm
+            first = line.value(0) * self.mm
+            second = line.value(1) * self.mm
             is_clear = line.keyword in {"CLAP", "FLAP", "SQAP", "ELAP"}
             if line.keyword == "SPID":
                 arms = int(line.value(1))

@@ -101,7 +101,9 @@ def diffracted(pupil: Pupil, per_px: int) -> Stack:
         np.linspace(0, size - 1, pupil.points) if pupil.points > 1 else [(size - 1) / 2]
         for size in (width, height)
     )
-    images, places, facts = [], [], []
+    images = []
+    places = []
+    facts = []
     for x_px, y_px, nm, focus_um in product(
         columns, rows, sorted(set(pupil.wavelengths_nm)), sorted(set(pupil.focuses_um))
     ):
@@ -162,11 +164,14 @@ class PupilField:
                 case "W220":
                     wave_nm = wave_nm + size_nm * radius**2 * self._r2
         lit = self._amplitude > 0
-        steps = [
-            np.abs(np.diff(wave_nm, axis=k))[lit[1:, :] if k == 0 else lit[:, 1:]].max(initial=0.0)
-            / nm
-            for k in (0, 1)
-        ]
+        steps = []
+        for k in (0, 1):
+            steps.append(
+                np.abs(np.diff(wave_nm, axis=k))[lit[1:, :] if k == 0 else lit[:, 1:]].max(
+                    initial=0.0
+                )
+                / nm
+            )
         if max(steps) > MAX_STEP_WAVES:
             raise InputError(
                 f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {max(steps):.2g}"
@@ -185,10 +190,8 @@ def aperture(pupil: Pupil) -> FloatArray:
     half = pupil.spider_width_mm / pupil.aperture_mm
     for k in range(pupil.spiders):
         angle = math.radians(pupil.spider_angle_deg + 360 * k / pupil.spiders)
-        along, across = (
-            x * math.cos(angle) + y * math.sin(angle),
-            y * math.cos(angle) - x * math.sin(angle),
-        )
+        along = x * math.cos(angle) + y * math.sin(angle)
+        across = y * math.cos(angle) - x * math.sin(angle)
         is_open &= (np.abs(across) > half) | (along < 0)
     return np.asarray(is_open.reshape(PUPIL, FINER, PUPIL, FINER).mean(axis=(1, 3)))
 

@@ -47,9 +47,11 @@ class BodyLayer:
     """Bodies wider than POINT_PX as discs; narrower ones are points among the stars."""
 
     def __init__(self, moving: "MovingSky", canvas: Canvas) -> None:
-        self.canvas, self._moving = canvas, moving
+        self.canvas = canvas
+        self._moving = moving
         px_rad = canvas.camera.scales_px_rad()
-        self._px_sr, self._px_per_rad = px_rad[0] ** -2, px_rad[1]
+        self._px_sr = px_rad[0] ** -2
+        self._px_per_rad = px_rad[1]
         self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
@@ -82,7 +84,8 @@ class BodyLayer:
 
     def on_image(self, view: View) -> list[Disc]:
         """Discs that touch the image of a camera at rest, nearest first."""
-        camera, icrs_to_image = self.canvas.camera, view.icrs_to_image(self.canvas.camera)
+        camera = self.canvas.camera
+        icrs_to_image = view.icrs_to_image(self.canvas.camera)
         lights = (
             DiscLight(disc, icrs_to_image, camera, self.canvas.psf) for disc in self._near(view)
         )
@@ -100,10 +103,11 @@ class BodyLayer:
         radii_rad = (
             np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
         )
-        discs = [
-            Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert")
-            for r in radii_rad.tolist()
-        ]
+        discs = []
+        for r in radii_rad.tolist():
+            discs.append(
+                Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert")
+            )
         return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
 
     def unhidden(
@@ -112,17 +116,18 @@ class BodyLayer:
         """Sprites as seen past `discs` and through their air, without those of the discs
         themselves.
         """
-        which, first = light.star, len(stars) - len(self._moving.names)
-        through, directions = np.ones(len(which)), stars.directions(which)
+        which = light.star
+        first = len(stars) - len(self._moving.names)
+        through = np.ones(len(which))
+        directions = stars.directions(which)
         # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds
         # those that nothing hides.
         satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
         point = np.flatnonzero(which >= first)
-        far_km = (
-            self._moving.distances_km(*view.observer)[which[point] - first]
-            if len(point)
-            else np.empty(0)
-        )
+        if len(point):
+            far_km = self._moving.distances_km(*view.observer)[which[point] - first]
+        else:
+            far_km = np.empty(0)
         for disc in discs:
             # more than a cosine rounds
             reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7
@@ -133,37 +138,43 @@ class BodyLayer:
             if len(behind):
                 through[behind] *= disc.transmission(directions[behind])
         through[np.isin(light.star, disc_stars(stars, (disc.name for disc in discs)))] = 0.0
-        kept = through >= HIDDEN
-        if kept.all() and (through == 1).all():
+        is_shown = through >= HIDDEN
+        if is_shown.all() and (through == 1).all():
             return light
-        data = light.data[kept]
-        data["electrons_per_s"] *= through[kept].astype(np.float32)
+        data = light.data[is_shown]
+        data["electrons_per_s"] *= through[is_shown].astype(np.float32)
         return replace(
-            light, data=data, star=light.star[kept], x_px=light.x_px[kept], y_px=light.y_px[kept]
+            light,
+            data=data,
+            star=light.star[is_shown],
+            x_px=light.x_px[is_shown],
+            y_px=light.y_px[is_shown],
         )
 
     def _near(self, view: View) -> list[Disc]:
         """Discs that may be on the image at some time of a view, and that no other hides,
         nearest first.
         """
-        reach_rad, wide_rad = self._reach_rad, POINT_PX / self._px_per_rad
+        reach_rad = self._reach_rad
+        wide_rad = POINT_PX / self._px_per_rad
         if view.turns:
             reach_rad += view.turn.speed_rad_s * (
                 view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
             )
         axis = view.icrs_to_image(self.canvas.camera)[2]
-        found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
-        kept = []
-        for k, disc in enumerate(found):
-            places = (
-                np.vstack([disc.direction, disc.limb(LIMB_PLACES)]) if k else disc.direction[None]
-            )
+        discs = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
+        wide_discs = []
+        for k, disc in enumerate(discs):
+            if k:
+                places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
+            else:
+                places = disc.direction[None]
             through = np.ones(len(places))
-            for nearer in found[:k]:
+            for nearer in discs[:k]:
                 through *= nearer.transmission(places)
             if through.max() >= HIDDEN:
-                kept.append(disc)
-        return kept
+                wide_discs.append(disc)
+        return wide_discs
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
         return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
@@ -172,21 +183,25 @@ class BodyLayer:
         """The camera during an exposure: poses that follow one another along its turn, all with
         the exposure's mean light.
         """
-        camera, exposure_s = self.canvas.camera, view.scan.hold_s
+        camera = self.canvas.camera
+        exposure_s = view.scan.hold_s
         length_sigma = (
             view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
         )
         count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
         place, weight = gauss_legendre(count)
         maps = view.motion.icrs_to_image(place / 2 * exposure_s, camera)
-        poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
+        poses = tuple(
+            Pose(pose_map, float(share / 2)) for pose_map, share in zip(maps, weight, strict=True)
+        )
         return DiscView(
             camera, self.canvas.psf, poses, _shear(view.scan, view.turn.rate_cam_rad_s, camera)
         )
 
     def _turning(self, view: View, max_poses: int) -> DiscView:
         """The camera while a screen's rows light up one after the other, each held for a time."""
-        camera, scan = self.canvas.camera, view.scan
+        camera = self.canvas.camera
+        scan = view.scan
         turn, _ = slowed(view.turn, scan, camera)
         length_sigma = (
             turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
@@ -237,12 +252,12 @@ class BodyLayer:
             np.linspace(top, top + height - 1, LATTICE),
         )
         u, v = camera.tangents(x.ravel(), y.ravel())
-        seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
+        rays = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
         # And of its lit face: a crescent may lie between those of the lattice
         places, _ = light.disc.points(LATTICE)
         on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
         of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
-        return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), of_face)
+        return max(float(light.disc.radiance(rays @ light.icrs_to_image).max()), of_face)
 
 
 def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | None:

@@ -34,23 +34,29 @@ class DiffuseLayer:
     """
 
     def __init__(self, images: tuple[TangentImage, ...], canvas: Canvas) -> None:
-        self._camera, self._faintest = canvas.camera, canvas.first_step_e_per_s
+        self._camera = canvas.camera
+        self._faintest = canvas.first_step_e_per_s
         camera = canvas.camera
         finest_rad, coarsest_rad = (1 / scale for scale in reversed(camera.scales_px_rad()))
         width, height = camera.resolution_px
         self._counts = -(-width // CELL_PX) + 1, -(-height // CELL_PX) + 1
         self._across, self._down = map(linear_shares, camera.resolution_px, self._counts)
-        places, shape = camera.grid_px(self._counts), self._counts[::-1]
+        places = camera.grid_px(self._counts)
+        shape = self._counts[::-1]
         rays = camera.rays(*places).reshape(*shape, 3)
         self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         self._sr = np.nan_to_num(camera.pixel_sr(*places)).reshape(shape)
         least = self._faintest / self._sr.max()
         sigma_px = math.sqrt(math.fsum(canvas.psf.variance_px2) / 2)
-        seen = [one.seen_by(finest_rad, sigma_px) for one in images]
+        smoothed = [sky_image.seen_by(finest_rad, sigma_px) for sky_image in images]
         self._brightest = max(
-            (float(one.image.max() * self._sr.max()) for one in seen), default=0.0
+            (float(sky_image.image.max() * self._sr.max()) for sky_image in smoothed), default=0.0
         )
-        self._faces = [_Face(one, coarsest_rad, least) for one in seen if one.image.max() > least]
+        self._faces = [
+            _Face(sky_image, coarsest_rad, least)
+            for sky_image in smoothed
+            if sky_image.image.max() > least
+        ]
         self._middles = np.array([face.middle for face in self._faces]).reshape(-1, 3)
         reach_rad = math.acos(float(np.nanmin(self._rays[..., 2])))
         radii_rad = np.arccos([face.cos_radius for face in self._faces])
@@ -71,31 +77,30 @@ class DiffuseLayer:
             )
         if self._kept is None or not np.array_equal(cell, self._kept[0]):
             icrs_to_cam = to_matrix(normalise(cell))
-            near = [
-                self._faces[k]
-                for k in np.flatnonzero(self._middles @ icrs_to_cam[2] >= self._cos_reach)
-            ]
+            near = []
+            for k in np.flatnonzero(self._middles @ icrs_to_cam[2] >= self._cos_reach):
+                near.append(self._faces[k])
             faces_of_cube = sum(face.is_of_cube for face in near)
-            taken = (
-                np.zeros(self._camera.resolution_px[::-1], dtype=bool)
-                if faces_of_cube > 1
-                else None
-            )
+            if faces_of_cube > 1:
+                taken = np.zeros(self._camera.resolution_px[::-1], dtype=bool)
+            else:
+                taken = None
             lit = (
                 self._lit(face, icrs_to_cam, taken if face.is_of_cube else None) for face in near
             )
             self._kept = cell, tuple(itertools.chain.from_iterable(lit))
         maps = self._kept[1]
-        return replace(light, extended=(*light.extended, *maps)) if maps else light
+        if maps:
+            return replace(light, extended=(*light.extended, *maps))
+        return light
 
     def line(self) -> str:
         """How bright it is on a monitor."""
         steps = self._brightest / (self._faintest or math.inf)
-        drawn = (
-            "is drawn where it passes one"
-            if steps > 1
-            else "is not drawn; the virtual tracker has it"
-        )
+        if steps > 1:
+            drawn = "is drawn where it passes one"
+        else:
+            drawn = "is not drawn; the virtual tracker has it"
         return (
             f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's"
             f" first step; it {drawn}"
@@ -115,12 +120,12 @@ class DiffuseLayer:
         # no whole cell: its light is two cells and more beside the image
         if min(map(len, lit)) < 2:
             return []
-        around = tuple(slice(int(one[0]), int(one[-1]) + 1) for one in lit)
+        around = tuple(slice(int(lit_places[0]), int(lit_places[-1]) + 1) for lit_places in lit)
         x_px, y_px = face.image.places_px(self._rays[around] @ icrs_to_cam)
         bright = face.most_at(x_px, y_px) * self._sr[around] > self._faintest
         cells = bright[:-1, :-1] | bright[1:, :-1] | bright[:-1, 1:] | bright[1:, 1:]
         groups, _ = label(cells)
-        found = []
+        parts = []
         for number, box in enumerate(find_objects(groups), start=1):
             part = self._part(box, around, groups[box] == number)
             x, y, sr = (part.spread(of) for of in (x_px, y_px, self._sr[around]))
@@ -129,8 +134,8 @@ class DiffuseLayer:
             image = map_coordinates(
                 face.image.image, [y, x], order=1, mode="grid-constant", output=np.float32
             )
-            found.append(LightMap(image * sr * part.own, part.corner_px, bv_mag=face.image.bv_mag))
-        return found
+            parts.append(LightMap(image * sr * part.own, part.corner_px, bv_mag=face.image.bv_mag))
+        return parts
 
     def _part(self, box: tuple[slice, ...], around: tuple[slice, ...], own: BoolArray) -> "_Part":
         """The pixels of a box of cells, counted from the first ones `around`, of which some are
@@ -195,10 +200,8 @@ class _Face:
         from scipy.ndimage import maximum_filter
 
         self.image = image
-        self.middle_px, self.is_of_cube = (
-            (len(image.image) - 1) / 2,
-            math.isfinite(image.max_tangent),
-        )
+        self.middle_px = (len(image.image) - 1) / 2
+        self.is_of_cube = math.isfinite(image.max_tangent)
         # From a corner to the far end of its cells, on a plane whose scale grows by 3 at a cube's
         # corner
         self._reach_px = math.ceil(CELL_PX * px_rad * image.px_per_tangent * 3 * math.sqrt(2)) + 1

@@ -325,8 +325,11 @@ def fault_of(table: Any) -> Fault:
     keys = {key: value for key, value in table.items() if key != "kind"}
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
-        said = "the key kind is missing" if kind is None else f"kind = {shortened(repr(kind))}"
-        raise InputError(f"{said}; {did_you_mean(kind, KINDS)}write one of {', '.join(KINDS)}")
+        if kind is None:
+            kind_text = "the key kind is missing"
+        else:
+            kind_text = f"kind = {shortened(repr(kind))}"
+        raise InputError(f"{kind_text}; {did_you_mean(kind, KINDS)}write one of {', '.join(KINDS)}")
     made = KINDS[kind]
     _check_finite(keys)
     try:
@@ -352,8 +355,8 @@ def fault_of(table: Any) -> Fault:
 
 def table_of(fault: Fault) -> dict[str, Any]:
     """The table that makes the same fault again."""
-    found = {key: value for key, value in msgspec.to_builtins(fault).items() if value is not None}
-    return {"kind": fault.KIND, **found}
+    table = {key: value for key, value in msgspec.to_builtins(fault).items() if value is not None}
+    return {"kind": fault.KIND, **table}
 
 
 def _check_finite(value: Any, key: str = "") -> None:

@@ -86,7 +86,10 @@ class FaultView:
         folder: Path | None = None,
         lasting: frozenset[Fault] = frozenset(),
     ) -> None:
-        self.by, self._seed, self._folder, self._lasting = by, seed, folder, lasting
+        self.by = by
+        self._seed = seed
+        self._folder = folder
+        self._lasting = lasting
         self._glow_kept: tuple[Fault, float, extended.GlowLight] | None = None
         self._lock = threading.Lock()
         self._found: dict[tuple[int, int | str], tuple[object, IntArray]] = {}
@@ -105,7 +108,10 @@ class FaultView:
             fault = msgspec.structs.replace(fault, for_s=self.by.exposure_s)
         by_star = isinstance(fault, Flash | StarGone) and (fault.hip or fault.star)
         if by_star and not len(self._places(self.by.stars, fault)):
-            said = f'star = "{by_star}"' if isinstance(by_star, str) else f"hip = {by_star}"
+            if isinstance(by_star, str):
+                said = f'star = "{by_star}"'
+            else:
+                said = f"hip = {by_star}"
             raise InputError(
                 f"{said}: not among the {len(self.by.stars)} stars and bodies of this bench; write"
                 " one that is, or look at [sky] faintest_v_mag"
@@ -119,7 +125,10 @@ class FaultView:
         ):
             camera, place = self._source(fault)
             if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
-                key = "tracker_px" if fault.tracker_px is not None else "screen_px"
+                if fault.tracker_px is not None:
+                    key = "tracker_px"
+                else:
+                    key = "screen_px"
                 raise InputError(
                     f"{key} = {list(place)}: the lens has no direction there; write a place nearer"
                     " to the image"
@@ -130,10 +139,8 @@ class FaultView:
         """A fault's electrons per second: of a point, or in the tracker's brightest pixel; 1
         where a map says it.
         """
-        per_s, in_exposure = (
-            getattr(fault, "electrons_per_s", None),
-            getattr(fault, "electrons", None),
-        )
+        per_s = getattr(fault, "electrons_per_s", None)
+        in_exposure = getattr(fault, "electrons", None)
         if per_s is not None:
             return float(per_s)
         if in_exposure is not None:
@@ -151,7 +158,8 @@ class FaultView:
         with self._lock:
             known = self._maps.get(fault)
         if known is None:
-            by, camera = self.by, self.by.canvas.camera
+            by = self.by
+            camera = self.by.canvas.camera
             if isinstance(fault, Gradient):
                 image = gradient_image(fault, camera, by.tracker)
             elif self._folder is None:
@@ -171,7 +179,7 @@ class FaultView:
         with self._lock:
             self._maps.pop(fault, None)
             self._maps[fault] = known  # the last used is the last to go
-            others = [kept for kept in self._maps if kept not in self._lasting]
+            others = [key for key in self._maps if key not in self._lasting]
             if len(others) > KEPT_MAPS:
                 self._maps.pop(others[0])
         return known
@@ -188,9 +196,10 @@ class FaultView:
         """False stars and flashes that are fixed on the sky: their directions (n, 3), and their
         names and light.
         """
-        vectors, lights = [], []
-        for one in now:
-            fault = one.fault
+        vectors = []
+        lights = []
+        for active in now:
+            fault = active.fault
             if (
                 not isinstance(fault, FalseStar | Flash)
                 or fault.tracker_px is not None
@@ -199,22 +208,23 @@ class FaultView:
                 continue
             if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
                 # A star too faint to show is among all of the bench's stars.
-                at = [
-                    known.vectors[place]
-                    for known in (stars, self.by.stars)
-                    for place in self._places(known, fault)[:1]
-                ]
+                at = []
+                for known in (stars, self.by.stars):
+                    for place in self._places(known, fault)[:1]:
+                        at.append(known.vectors[place])
             else:
                 at = [self.by.apparent(icrs_direction(fault)[None])[0]]
             if at:
                 vectors.append(at[0])
-                lights.append(self._added(fault, one.share))
+                lights.append(self._added(fault, active.share))
         return np.reshape(vectors, (-1, 3)), lights
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
         """The direction (3,), ICRS, of the star that a fault is about; None if it is about none."""
-        found = self._places(self.by.stars, fault)
-        return np.asarray(self.by.stars.vectors[found[0]]) if len(found) else None
+        star_rows = self._places(self.by.stars, fault)
+        if len(star_rows):
+            return np.asarray(self.by.stars.vectors[star_rows[0]])
+        return None
 
     def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
         rate = self.light_e_per_s(fault) * share
@@ -231,18 +241,19 @@ class FaultView:
         """False stars and flashes that move with the camera, and tracks: chains, and the name
         and light of each line.
         """
-        chains, lights = [], []
-        for one in now:
-            fault = one.fault
+        chains = []
+        lights = []
+        for active in now:
+            fault = active.fault
             if isinstance(fault, FalseStar | Flash) and (
                 fault.tracker_px is not None or fault.screen_px is not None
             ):
-                chains.append(self._moving(fault, one, scan))
-                lights.append(self._added(fault, one.share))
+                chains.append(self._moving(fault, active, scan))
+                lights.append(self._added(fault, active.share))
             elif isinstance(fault, CosmicRays):
-                burst = self._burst(fault, max(0, one.since_ns))
-                chains.append(replace(burst, electrons_per_s=burst.electrons_per_s * one.share))
-                rate = fault.electrons / self.by.exposure_s * one.share
+                burst = self._burst(fault, max(0, active.since_ns))
+                chains.append(replace(burst, electrons_per_s=burst.electrons_per_s * active.share))
+                rate = fault.electrons / self.by.exposure_s * active.share
                 v_mag = float(magnitude(rate / self.by.v0_e_per_s(TRACK_BV_MAG)))
                 lights += [AddedLight(fault.name, v_mag, TRACK_BV_MAG, rate)] * fault.number
         return chains, lights
@@ -250,17 +261,17 @@ class FaultView:
     def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> "PointChain":
         """A point's path over the pixels while they are lit."""
         by, (source, place) = self.by, self._source(fault)
-        rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
-        begin_s, hold_s = since_s, 0.0
+        rate = np.array(fault.rate_px_s)
+        since_s = one.since_ns / NS_PER_S
+        begin_s = since_s
+        hold_s = 0.0
         if scan is not None and rate.any():
             x_px, y_px = by.canvas.camera.pixels_from(
                 source, *(np.array([place]) + rate * since_s).T
             )
             late_s = scan.late_s(x_px, y_px, by.canvas.camera.resolution_px)[0]
-            begin_s, hold_s = (
-                since_s + (float(late_s) if math.isfinite(late_s) else 0.0),
-                scan.hold_s,
-            )
+            begin_s = since_s + (float(late_s) if math.isfinite(late_s) else 0.0)
+            hold_s = scan.hold_s
         ends = [(np.array(place) + rate * seconds)[None] for seconds in (begin_s, begin_s + hold_s)]
         light = np.array([self.light_e_per_s(fault) * one.share])
         return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.psf)
@@ -284,9 +295,11 @@ class FaultView:
 
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
         """Stars that a fault removes, and the share of their light that is left in this frame."""
-        taken = [one for one in now if isinstance(one.fault, StarGone)]
+        taken = [active for active in now if isinstance(active.fault, StarGone)]
         return [
-            (int(star), 1 - one.share) for one in taken for star in self._places(stars, one.fault)
+            (int(star), 1 - active.share)
+            for active in taken
+            for star in self._places(stars, active.fault)
         ]
 
     def _places(self, stars: Stars, fault: Fault) -> IntArray:
@@ -314,14 +327,14 @@ class FaultView:
     ) -> list[extended.ExtendedLight]:
         """The stray light of the faults that are on."""
         found: list[extended.ExtendedLight] = []
-        for one in now:
-            fault = one.fault
+        for active in now:
+            fault = active.fault
             if isinstance(fault, Glow):
-                found.append(self._glow(fault, one.share, q_icrs_to_cam))
+                found.append(self._glow(fault, active.share, q_icrs_to_cam))
             elif isinstance(fault, Gradient | MeasuredMap):
                 light = self._map(fault)
                 found.append(
-                    light if one.share == 1 else replace(light, times=light.times * one.share)
+                    light if active.share == 1 else replace(light, times=light.times * active.share)
                 )
         return found
 
@@ -357,13 +370,12 @@ class FaultView:
         """The sprites of chains. Their lines are numbered from one chain to the next, as stars
         -1, -2 and on.
         """
-        made, first = [], 0
+        made = []
+        first = 0
         for chain in chains:
             star = -1 - first - chain.line
-            size_px, footprint_px = (
-                self.by.canvas.camera.resolution_px,
-                self.by.canvas.psf.footprint_px,
-            )
+            size_px = self.by.canvas.camera.resolution_px
+            footprint_px = self.by.canvas.psf.footprint_px
             made.append(
                 pack_sprites(
                     chain.x_px, chain.y_px, chain.electrons_per_s, star, size_px, footprint_px
@@ -432,9 +444,9 @@ class Lines:
         """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its
         lens have no points.
         """
-        ends = [
-            np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)
-        ]
+        ends = []
+        for place in (self.begin_px, self.end_px):
+            ends.append(np.stack(camera.pixels_from(source, *place.T)))
         length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(psf.width_px)[:, None]))
         known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
         counts = np.where(

@@ -37,7 +37,7 @@ class FaultLayer:
     now: tuple[Now, ...] = ()
 
     def _has(self, kind: type[Fault]) -> bool:
-        return any(isinstance(one.fault, kind) for one in self.now)
+        return any(isinstance(active.fault, kind) for active in self.now)
 
     @property
     def blank(self) -> bool:
@@ -52,10 +52,10 @@ class FaultLayer:
     def drops(self, frame: int) -> bool:
         """Whether frame number `frame` is never shown."""
         return any(
-            one.fault.share == 1
-            or self.view.rng(one.fault.name, FRAME_SEED, frame).random() < one.fault.share
-            for one in self.now
-            if isinstance(one.fault, Drop)
+            active.fault.share == 1
+            or self.view.rng(active.fault.name, FRAME_SEED, frame).random() < active.fault.share
+            for active in self.now
+            if isinstance(active.fault, Drop)
         )
 
     def turned(self, view: View) -> View:
@@ -64,11 +64,13 @@ class FaultLayer:
         """
         if not self._has(AttitudeStep):
             return view
-        q, step = view.q_icrs_to_cam, NO_TURN
-        for one in self.now:
-            if isinstance(one.fault, AttitudeStep):
-                turn_rad = np.array(one.fault.turn_rad)
-                q, step = propagate(q, turn_rad, 1.0), propagate(step, turn_rad, 1.0)
+        q = view.q_icrs_to_cam
+        step = NO_TURN
+        for active in self.now:
+            if isinstance(active.fault, AttitudeStep):
+                turn_rad = np.array(active.fault.turn_rad)
+                q = propagate(q, turn_rad, 1.0)
+                step = propagate(step, turn_rad, 1.0)
         rate = view.rate_cam_rad_s
         return replace(
             view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate
@@ -78,16 +80,16 @@ class FaultLayer:
         """The light before without the stars that faults take away, and with the light that they
         add.
         """
-        by, now = self.view, self.now
+        by = self.view
+        now = self.now
         if self.blank:
             return replace(no_light(light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
         gone = by.gone(now, stars)
         if gone:
-            removed = {
-                one.fault.star: 1 - one.share
-                for one in now
-                if isinstance(one.fault, StarGone) and one.fault.star
-            }
+            removed = {}
+            for active in now:
+                if isinstance(active.fault, StarGone) and active.fault.star:
+                    removed[active.fault.star] = 1 - active.share
             light = _without_discs(_dimmed(light, gone), removed)
         directions, named = by.sky_points(now, stars)
         chains, lines = by.camera_points(now, None if view.rate_cam_rad_s is None else view.scan)
@@ -104,28 +106,31 @@ class FaultLayer:
             )
             per_star = max(light.per_star, *(part.per_star for part in parts), *longest)
             light = replace(with_sprites(light, parts), per_star=per_star, added=(*lines, *named))
-        return replace(light, extended=(*light.extended, *surfaces)) if surfaces else light
+        if surfaces:
+            return replace(light, extended=(*light.extended, *surfaces))
+        return light
 
 
 def _dimmed(sprites: FrameLight, gone: list[tuple[int, float]]) -> FrameLight:
     """Sprites without some stars, or with a share of their light."""
-    data, kept = sprites.data, np.ones(len(sprites), dtype=bool)
-    for star, left in gone:
+    data = sprites.data
+    is_shown = np.ones(len(sprites), dtype=bool)
+    for star, remaining_share in gone:
         its = sprites.star == star
-        if left <= 0:
-            kept &= ~its
+        if remaining_share <= 0:
+            is_shown &= ~its
         elif its.any():
             data = data.copy()
-            data["electrons_per_s"][its] *= np.float32(left)
+            data["electrons_per_s"][its] *= np.float32(remaining_share)
     whole = replace(sprites, data=data)
-    if kept.all():
+    if is_shown.all():
         return whole
     return replace(
         whole,
-        data=data[kept],
-        star=sprites.star[kept],
-        x_px=sprites.x_px[kept],
-        y_px=sprites.y_px[kept],
+        data=data[is_shown],
+        star=sprites.star[is_shown],
+        x_px=sprites.x_px[is_shown],
+        y_px=sprites.y_px[is_shown],
     )
 
 

@@ -48,16 +48,18 @@ class SatelliteLayer:
         """The light before and that of the satellites in the image, which are written into the
         arrays of `stars`.
         """
-        canvas, satellites = self.canvas, self.moving.satellites
-        rows, turn = view.rows, view.turn
+        canvas = self.canvas
+        satellites = self.moving.satellites
+        rows = view.rows
+        turn = view.turn
         if not view.exposed:
             turn, _ = slowed(turn, view.scan, canvas.camera)
         # between the moment of the attitude and any light
         longest_s = max(abs(view.begin_s), rows.longest_s)
         margin_px = canvas.psf.footprint_px / 2 + 1
         reach_rad = canvas.camera.field_radius_rad(margin_px) + turn.speed_rad_s * longest_s
-        seen = self._passing(view, reach_rad, longest_s)
-        if seen is None or satellites is None:
+        passing = self._passing(view, reach_rad, longest_s)
+        if passing is None or satellites is None:
             return light
         icrs_to_image = view.icrs_to_image(canvas.camera)
         path = TrailView(
@@ -66,36 +68,41 @@ class SatelliteLayer:
             canvas.camera.cam_to_image @ turn.rate_cam_rad_s,
             stars.velocity_km_s,
         )
-        close = path.in_reach(seen, longest_s, margin_px)
+        close = path.in_reach(passing, longest_s, margin_px)
         if not len(close):
             return light
-        seen, brush = seen.only(close), self._brush(view)
+        passing = passing.only(close)
+        brush = self._brush(view)
         if satellites.sized:
-            broad = wide(seen, canvas.camera.scales_px_rad()[1], POINT_PX)
+            broad = wide(passing, canvas.camera.scales_px_rad()[1], POINT_PX)
             if broad.any():
-                wide_ones = seen.only(np.flatnonzero(broad))
+                wide_ones = passing.only(np.flatnonzero(broad))
                 light = self._with_discs(light, stars, wide_ones, path, view)
-                seen = seen.only(np.flatnonzero(~broad))
-        found = trails(seen, path, self._lit(seen, path, view), brush, self.faintest_e_per_s)
-        if not len(found.index):
+                passing = passing.only(np.flatnonzero(~broad))
+        drawn_trails = trails(
+            passing, path, self._lit(passing, path, view), brush, self.faintest_e_per_s
+        )
+        if not len(drawn_trails.index):
             return light
-        satellites.write(stars, found.index, found.middle, found.electrons_per_s)
-        return with_trails(light, found, len(stars) - len(stars.bodies))
+        satellites.write(
+            stars, drawn_trails.index, drawn_trails.middle, drawn_trails.electrons_per_s
+        )
+        return with_trails(light, drawn_trails, len(stars) - len(stars.bodies))
 
     def discs(self, stars: Stars, view: View) -> "list[Disc]":
         """The satellites in the image of a camera at rest that are discs."""
         satellites = self.moving.satellites
         if satellites is None or not satellites.sized:
             return []
-        seen = self._passing(
+        passing = self._passing(
             view, self.canvas.camera.field_radius_rad(0.0), 0.0, faintest_e_per_s=0.0
         )
-        if seen is None:
+        if passing is None:
             return []
-        broad = np.flatnonzero(wide(seen, self.canvas.camera.scales_px_rad()[1], POINT_PX))
+        broad = np.flatnonzero(wide(passing, self.canvas.camera.scales_px_rad()[1], POINT_PX))
         names = satellites.names
         return [
-            disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s)
+            disc_of(passing.only(np.array([k])), names[passing.index[k]], 0.0, stars.velocity_km_s)
             for k in broad.tolist()
         ]
 
@@ -106,7 +113,10 @@ class SatelliteLayer:
         from hilstar.sky.bodies.passes import Cone  # imports SGP4, which only satellites need
 
         axis = view.icrs_to_image(self.canvas.camera)[2]
-        faintest = self.faintest_e_per_s if faintest_e_per_s is None else faintest_e_per_s
+        if faintest_e_per_s is None:
+            faintest = self.faintest_e_per_s
+        else:
+            faintest = faintest_e_per_s
         return self.moving.passing(Cone(axis, reach_rad, longest_s, faintest), *view.observer)
 
     def _brush(self, view: View) -> Brush:
@@ -117,7 +127,8 @@ class SatelliteLayer:
 
     def _lit(self, seen: "Pass", path: TrailView, view: View) -> Lit:
         """When each satellite's row is lit."""
-        rows, late_s = view.rows, np.zeros(len(seen))
+        rows = view.rows
+        late_s = np.zeros(len(seen))
         for _ in range(ROW_ROUNDS if rows.scanout_s else 0):
             x_px, y_px = path.places_px(seen, EVERY, late_s)
             late_s = np.nan_to_num(rows.late_s(x_px, y_px, self.canvas.camera.resolution_px))
@@ -132,29 +143,38 @@ class SatelliteLayer:
         satellites: Satellites | None = self.moving.satellites
         if satellites is None:
             return light
-        lit, drawn = self._lit(seen, path, view), []
+        lit = self._lit(seen, path, view)
+        drawn = []
         for k in np.argsort(-np.linalg.norm(seen.seen_km[0], axis=1)):
-            own = Lit(lit.begin_s[[k]], lit.length_s)
+            lit_span = Lit(lit.begin_s[[k]], lit.length_s)
             name = satellites.names[seen.index[k]]
-            found = disc_trail(seen.only(np.array([k])), name, path, own, self._brush(view))
-            if found is not None:
-                drawn.append(found)
-                light = hidden(light, stars.directions(light.star), found)
-        index, rates = (
-            np.array([one.index for one in drawn], dtype=np.intp),
-            np.array([one.electrons_per_s for one in drawn]),
-        )
+            trail = disc_trail(seen.only(np.array([k])), name, path, lit_span, self._brush(view))
+            if trail is not None:
+                drawn.append(trail)
+                light = hidden(light, stars.directions(light.star), trail)
+        index = np.array([trail_light.index for trail_light in drawn], dtype=np.intp)
+        rates = np.array([trail_light.electrons_per_s for trail_light in drawn])
         satellites.write(
-            stars, index, np.array([one.middle for one in drawn]).reshape(-1, 3), rates
+            stars,
+            index,
+            np.array([trail_light.middle for trail_light in drawn]).reshape(-1, 3),
+            rates,
         )
         white_e_per_s = self.canvas.white_in(view)
-        names = tuple(one.along[0].name for one in drawn)
+        names = tuple(trail_light.along[0].name for trail_light in drawn)
         return replace(
             light,
-            extended=(*light.extended, *(part for one in drawn for part in one.lights)),
+            extended=(
+                *light.extended,
+                *(part for trail_light in drawn for part in trail_light.lights),
+            ),
             discs=(*light.discs, *names),
             over_white=(
                 *light.over_white,
-                *(one.along[0].name for one in drawn if one.brightest_e_per_s > white_e_per_s),
+                *(
+                    trail_light.along[0].name
+                    for trail_light in drawn
+                    if trail_light.brightest_e_per_s > white_e_per_s
+                ),
             ),
         )

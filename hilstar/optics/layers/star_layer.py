@@ -32,18 +32,23 @@ class StarLayer:
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before, with a sprite or a chain of sprites for each star on the image."""
-        canvas, camera = self.canvas, self.canvas.camera
+        canvas = self.canvas
+        camera = self.canvas.camera
         if self.paths and view.exposed and view.rate_cam_rad_s is not None:
             made = smeared_sprites(stars, view.motion, camera, canvas.psf, view.scan)
         elif self.paths and view.turns and not view.exposed:
             made = swept_sprites(stars, view.turn, view.scan, camera, canvas.psf)
             made = replace(made, rate_cam_rad_s=view.rate_cam_rad_s)
         else:
-            icrs_to_image = (
-                view.motion.icrs_to_image(MIDDLE_S, camera)[0]
-                if view.exposed
-                else view.icrs_to_image(camera)
-            )
-            candidates = self.candidates if stars is self.frequent else None
+            if view.exposed:
+                icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0]
+            else:
+                icrs_to_image = view.icrs_to_image(camera)
+            if stars is self.frequent:
+                candidates = self.candidates
+            else:
+                candidates = None
             made = make_sprites(stars, icrs_to_image, camera, canvas.psf.footprint_px, candidates)
-        return with_sprites(light, [made]) if light.extended or len(light.data) else made
+        if light.extended or len(light.data):
+            return with_sprites(light, [made])
+        return made

@@ -33,10 +33,8 @@ def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32A
     """
     x_px, y_px, area = pixels_in(camera, tracker)
     width, height = tracker.resolution_px
-    right, down = (
-        math.cos(math.radians(fault.towards_deg)),
-        math.sin(math.radians(fault.towards_deg)),
-    )
+    right = math.cos(math.radians(fault.towards_deg))
+    down = math.sin(math.radians(fault.towards_deg))
     extent_px = abs(right) * width + abs(down) * height
     rise = 0.5 + ((x_px - (width - 1) / 2) * right + (y_px - (height - 1) / 2) * down) / extent_px
     return as_light(np.maximum(rise, 0.0) * area)
@@ -55,8 +53,8 @@ def map_image(
     rows, columns = values.shape
     inside = source.contains_px(x_px, y_px)
     place = np.stack([(y_px + 0.5) * rows / height - 0.5, (x_px + 0.5) * columns / width - 0.5])
-    found = map_coordinates(values, np.where(inside, place, 0.0), order=1, mode="nearest")
-    return as_light(np.where(inside, found * area, 0.0))
+    sampled = map_coordinates(values, np.where(inside, place, 0.0), order=1, mode="nearest")
+    return as_light(np.where(inside, sampled * area, 0.0))
 
 
 def as_light(image: FloatArray) -> Float32Array:
@@ -89,13 +87,15 @@ def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
     places = [part.reshape(x.shape) for part in other.pixels_from(camera, x.ravel(), y.ravel())]
     if not all(np.isfinite(place).all() for place in places):
         rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
-        seen = other.pixels_from(camera, columns.ravel(), rows.ravel())
-        seen_x, seen_y = (part.reshape(height, width) for part in seen)
+        other_px = other.pixels_from(camera, columns.ravel(), rows.ravel())
+        seen_x, seen_y = (part.reshape(height, width) for part in other_px)
         (a, b), (c, d) = np.gradient(seen_x), np.gradient(seen_y)
         return PixelsIn(seen_x, seen_y, np.abs(b * c - a * d))
     along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
-    x_right, y_right = along_x(down, across, dy=1), along_y(down, across, dy=1)
-    x_down, y_down = along_x(down, across, dx=1), along_y(down, across, dx=1)
+    x_right = along_x(down, across, dy=1)
+    y_right = along_y(down, across, dy=1)
+    x_down = along_x(down, across, dx=1)
+    y_down = along_y(down, across, dx=1)
     covered = RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
     return PixelsIn(
         *(spline(np.arange(height), np.arange(width)) for spline in (along_x, along_y, covered))

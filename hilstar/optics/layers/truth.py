@@ -65,7 +65,8 @@ def truth_table(
     truth["drawn"] = True
     truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
     listed = stars.row[star] >= 0
-    row, catalog = stars.row[star[listed]], stars.catalog
+    row = stars.row[star[listed]]
+    catalog = stars.catalog
     truth["variable"][listed], truth["double"][listed] = (
         catalog.variable[row],
         catalog.multiple[row],
@@ -83,18 +84,19 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
 
     `colours` None, of a tracker with one channel: the rows themselves.
     """
-    light = (
-        None
-        if colours is None
-        else dict(
+    if colours is None:
+        light = None
+    else:
+        light = dict(
             zip(
                 CHANNEL_COLUMNS,
                 (truth["electrons_per_s"] * part for part in colours.T),
                 strict=True,
             )
         )
-    )
-    return truth if light is None else with_columns(truth, light)
+    if light is None:
+        return truth
+    return with_columns(truth, light)
 
 
 def with_errors(
@@ -113,12 +115,12 @@ def with_errors(
     stars = catalog.taken(order[np.searchsorted(catalog.hip[order], truth["hip"][listed])])
     facts = errors_of(stars)
     covariance = motion_at(stars, facts, epoch_jyear).covariance
-    found = truth.copy()
-    found["sigma_pos_mas"][listed] = np.round(
+    table = truth.copy()
+    table["sigma_pos_mas"][listed] = np.round(
         np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2), ERROR_DECIMALS
     )
-    found["sigma_mag"][listed] = np.round(sigma_v_mag(facts, stars.bv_mag), ERROR_DECIMALS)
-    return found
+    table["sigma_mag"][listed] = np.round(sigma_v_mag(facts, stars.bv_mag), ERROR_DECIMALS)
+    return table
 
 
 def designations(stars: Stars, sprites: FrameLight, which: IntArray) -> tuple[int | str, ...]:
@@ -132,8 +134,10 @@ def designations(stars: Stars, sprites: FrameLight, which: IntArray) -> tuple[in
 
 def sprite_names(stars: Stars, sprites: FrameLight) -> list[int | str]:
     """The star of each sprite: its HIP number, or its name without one."""
-    found = iter(stars.designations(sprites.star[sprites.star >= 0]))
-    return [sprites.added[-1 - k].name if k < 0 else next(found) for k in sprites.star.tolist()]
+    star_names = iter(stars.designations(sprites.star[sprites.star >= 0]))
+    return [
+        sprites.added[-1 - k].name if k < 0 else next(star_names) for k in sprites.star.tolist()
+    ]
 
 
 def sprite_truth(
@@ -146,20 +150,24 @@ def sprite_truth(
     """
     over = np.zeros(len(sprites), dtype=bool)
     over[clipped] = True
-    own = sprites.star >= 0
-    star, x_px, y_px = sprites.star[own], sprites.x_px[own], sprites.y_px[own]
+    is_star = sprites.star >= 0
+    star = sprites.star[is_star]
+    x_px = sprites.x_px[is_star]
+    y_px = sprites.y_px[is_star]
     once, which = np.unique(star, return_inverse=True)
     if len(once) < len(star):  # each star once, a satellite in the middle of its streak's light
-        light = sprites.data["electrons_per_s"][own].astype(np.float64)
+        light = sprites.data["electrons_per_s"][is_star].astype(np.float64)
         total = np.bincount(which, light)
         x_px, y_px = (np.bincount(which, light * places) / total for places in (x_px, y_px))
         star = once
     truth = truth_table(stars, star, x_px, y_px)
-    truth["clipped"] = over[own] if len(star) == own.sum() else np.isin(star, sprites.star[over])
+    truth["clipped"] = (
+        over[is_star] if len(star) == is_star.sum() else np.isin(star, sprites.star[over])
+    )
     if not sprites.added:
         return truth, star
     added = added_truth(sprites, over)
-    return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
+    return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~is_star])])
 
 
 def added_truth(sprites: FrameLight, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
@@ -217,37 +225,39 @@ def brightest_in_view(
 
     `stars` are those of the light, as seen at the attitude.
     """
-    found = np.union1d(light.star[light.star >= 0], disc_stars(stars, light.discs))
-    vectors = stars.directions(found)
+    star_rows = np.union1d(light.star[light.star >= 0], disc_stars(stars, light.discs))
+    vectors = stars.directions(star_rows)
     cam = vectors @ to_matrix(q_icrs_to_cam).T
     x_px, y_px = camera.project(cam @ camera.cam_to_image.T)
     inside = np.flatnonzero(camera.contains_px(x_px, y_px))
-    kept = inside[np.argsort(stars.v_mag[found[inside]], kind="stable")][:count]
-    found, cam, vectors, x_px, y_px = found[kept], cam[kept], vectors[kept], x_px[kept], y_px[kept]
+    brightest = inside[np.argsort(stars.v_mag[star_rows[inside]], kind="stable")][:count]
+    star_rows = star_rows[brightest]
+    cam = cam[brightest]
+    vectors = vectors[brightest]
+    x_px = x_px[brightest]
+    y_px = y_px[brightest]
     off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
     x, y, z = vectors.T
-    ra_deg, dec_deg = (
-        np.degrees(np.arctan2(y, x)) % 360.0,
-        np.degrees(np.arctan2(z, np.hypot(x, y))),
-    )
+    ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
+    dec_deg = np.degrees(np.arctan2(z, np.hypot(x, y)))
     constellations: list[str] = []
-    if len(found):
+    if len(star_rows):
         # takes half a second, which only this needs
         from astropy.coordinates import SkyCoord, get_constellation
 
         # IAU boundaries of 1930
-        constellations = [
-            str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))
-        ]
+        constellations = []
+        for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg")):
+            constellations.append(str(name))
     columns = (
-        stars.hip[found].tolist(),
-        stars.v_mag[found].tolist(),
+        stars.hip[star_rows].tolist(),
+        stars.v_mag[star_rows].tolist(),
         ra_deg.tolist(),
         dec_deg.tolist(),
         constellations,
         x_px.tolist(),
         y_px.tolist(),
         np.degrees(off_rad).tolist(),
-        stars.names(found),
+        stars.names(star_rows),
     )
     return [StarInView(*row) for row in zip(*columns, strict=True)]

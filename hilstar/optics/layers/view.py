@@ -100,12 +100,16 @@ class View:
     @property
     def rows(self) -> Scan:
         """How the image lights up: a still picture's rows all at once."""
-        return self.scan if self.rate_cam_rad_s is not None else Scan(hold_s=self.scan.hold_s)
+        if self.rate_cam_rad_s is not None:
+            return self.scan
+        return Scan(hold_s=self.scan.hold_s)
 
     @property
     def begin_s(self) -> float:
         """When the middle row's light begins, from the moment of the attitude."""
-        return -self.scan.hold_s / 2 if self.exposed or self.rate_cam_rad_s is None else 0.0
+        if self.exposed or self.rate_cam_rad_s is None:
+            return -self.scan.hold_s / 2
+        return 0.0
 
     def icrs_to_image(self, camera: Camera) -> FloatArray:
         """The matrix (3, 3) from ICRS to image axes at the moment of the attitude."""

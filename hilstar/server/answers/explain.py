@@ -38,21 +38,23 @@ class UnderConvention:
         """For a person."""
         c = self.convention
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(self.q_icrs_to_cam)
-        ra, roll = turn_text(ra_deg), turn_text(roll_deg)
+        ra = turn_text(ra_deg)
+        roll = turn_text(roll_deg)
         said = (
             f"scalar {c.scalar:<5} {c.direction:<11} {c.frame:<4}  RA {ra:>8}  Dec {dec_deg:+8.4f} "
             f" roll {roll:>8}"
         )
-        off = "" if self.off_rad is None else f"  {_angle(self.off_rad)} from what is shown"
+        if self.off_rad is None:
+            off = ""
+        else:
+            off = f"  {_angle(self.off_rad)} from what is shown"
         return f"{'>' if self.matches else ' '} {said}{off}"
 
 
 def _angle(off_rad: float) -> str:
-    return (
-        f"{np.degrees(off_rad):.2f} deg"
-        if off_rad > np.radians(1.0)
-        else f"{off_rad * ARCSEC_PER_RAD:.1f} arcsec"
-    )
+    if off_rad > np.radians(1.0):
+        return f"{np.degrees(off_rad):.2f} deg"
+    return f"{off_rad * ARCSEC_PER_RAD:.1f} arcsec"
 
 
 def under_conventions(
@@ -88,7 +90,10 @@ def under_conventions(
 
 def hex_line(raw: bytes) -> str:
     """Bytes in hexadecimal, cut where there are many."""
-    more = f" ... ({len(raw)} bytes)" if len(raw) > MAX_SHOWN_BYTES else ""
+    if len(raw) > MAX_SHOWN_BYTES:
+        more = f" ... ({len(raw)} bytes)"
+    else:
+        more = ""
     return raw[:MAX_SHOWN_BYTES].hex(" ") + more
 
 
@@ -104,10 +109,10 @@ def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
     if settings.checksum != "none" and raw:
         _, size = CHECKSUMS[settings.checksum]
         at = (-size if settings.checksum_at is None else settings.checksum_at) % len(raw)
-        said = decoder.frames.fault(raw) or f"{settings.checksum}, right"
+        checksum_text = decoder.frames.fault(raw) or f"{settings.checksum}, right"
         lines.append(
             f"  bytes {at:3} to {at + size - 1:3}  {raw[at : at + size].hex(' '):<24} checksum:"
-            f" {said}"
+            f" {checksum_text}"
         )
     for field in sorted(settings.fields, key=lambda field: field.at):
         _, size, _ = field_format(field.type) or ("u", 1, False)
@@ -133,22 +138,21 @@ def lines_of(
 ) -> list[str]:
     """An answer or a refusal explained, a line each."""
     if isinstance(found, RefusedAnswer):
-        return (
-            [f"  {hex_line(found.raw)}"]
-            if found.reason == "framing"
-            else byte_lines(found.raw, decoder)
-        )
-    said = under_conventions(found, decoder, shown)
-    lines = [*byte_lines(found.raw, decoder), *(each.line() for each in said)]
-    matching = next((each for each in said if each.matches), None)
+        if found.reason == "framing":
+            return [f"  {hex_line(found.raw)}"]
+        return byte_lines(found.raw, decoder)
+    readings = under_conventions(found, decoder, shown)
+    lines = [*byte_lines(found.raw, decoder), *(reading.line() for reading in readings)]
+    matching = next((reading for reading in readings if reading.matches), None)
     if matching is not None:
-        found_as, form = matching.convention, decoder.settings.format
+        found_as = matching.convention
+        form = decoder.settings.format
         scalar = "first" if form == "frame" else found_as.scalar
         written = msgspec.structs.replace(found_as, scalar=scalar)
-        own = found_as == decoder.sent.convention
+        is_own = found_as == decoder.sent.convention
         lines.append(
             "  the bench file's convention matches"
-            if own
+            if is_own
             else f"  write [answers] convention = {written}"
         )
         if form == "frame" and found_as.scalar == "last":
@@ -156,7 +160,7 @@ def lines_of(
                 "  and name its four fields qx, qy, qz, qw in the order in which they now are qw,"
                 " qx, qy, qz"
             )
-    elif shown is not None and said:
+    elif shown is not None and readings:
         lines.append(
             "  no convention matches what is shown: is it another sky, another mounting, or a"
             " mirrored frame?"

@@ -93,12 +93,14 @@ def answer_of(
     t_ns = said.t_ns
     if t_ns is not None and t_ns not in INT64:
         return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)
-    mode = (
-        ""
-        if said.mode is None
-        else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
-    )
-    stars = said.stars if said.stars is not None and 0 <= said.stars <= MAX_STARS else None
+    if said.mode is None:
+        mode = ""
+    else:
+        mode = printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
+    if said.stars is not None and 0 <= said.stars <= MAX_STARS:
+        stars = said.stars
+    else:
+        stars = None
     plain = Answer(
         host_ns,
         raw,
@@ -112,7 +114,9 @@ def answer_of(
         _reported(said.centroids),
     )
     if said.q is None or not said.valid:  # without an attitude its numbers may be anything
-        return replace(plain, valid=False) if said.q is None else plain
+        if said.q is None:
+            return replace(plain, valid=False)
+        return plain
     checked = checked_sample(0, said.q, said.rate)
     if isinstance(checked, Refusal):
         return RefusedAnswer(checked.reason, checked.detail, raw)
@@ -158,25 +162,33 @@ class Delimited:
         word: str,
         whole: bool = False,
     ) -> None:
-        self._end, self._max, self._unstuff, self._word = end, max_bytes, unstuff, word
-        self._kept, self._overlong, self._whole = bytearray(), False, whole
+        self._end = end
+        self._max = max_bytes
+        self._unstuff = unstuff
+        self._word = word
+        self._kept = bytearray()
+        self._overlong = False
+        self._whole = whole
 
     def cut(self, chunk: bytes) -> Iterator[Cut]:
         """The frames that `chunk` completes."""
         *bodies, rest = chunk.split(self._end)
         for body in bodies:
             self._keep(body)
-            kept, overlong, whole = bytes(self._kept), self._overlong, self._whole
+            buffered = bytes(self._kept)
+            overlong = self._overlong
+            whole = self._whole
             self._kept.clear()
-            self._overlong, self._whole = False, True
+            self._overlong = False
+            self._whole = True
             if overlong:
-                yield Cut(kept, "framing", f"no end of {self._word} within {self._max} bytes")
-            elif kept:
+                yield Cut(buffered, "framing", f"no end of {self._word} within {self._max} bytes")
+            elif buffered:
                 try:
-                    yield Cut(self._unstuff(kept))
+                    yield Cut(self._unstuff(buffered))
                 except ValueError as error:
                     if whole:
-                        yield Cut(kept, "framing", f"not {self._word} ({error})")
+                        yield Cut(buffered, "framing", f"not {self._word} ({error})")
         self._keep(rest)
 
     def _keep(self, part: bytes) -> None:
@@ -216,8 +228,10 @@ class Measured:
         self, settings: AnswersSettings, check: Callable[[bytes], str], certain: bool
     ) -> None:
         self._sync = b"" if settings.sync_hex is None else bytes.fromhex(settings.sync_hex)
-        self._length, self._ccsds = settings.length, settings.framing == "ccsds"
-        self._check, self._certain = check, certain
+        self._length = settings.length
+        self._ccsds = settings.framing == "ccsds"
+        self._check = check
+        self._certain = certain
         self._kept = bytearray()
         self._silent_bytes = 0  # lost bytes of which nothing more is said
 
@@ -239,31 +253,38 @@ class Measured:
             yield from self._cut()
 
     def _cut(self) -> Iterator[Cut]:
-        kept, at = self._kept, 0
-        while at < len(kept):
-            if self._sync and not kept.startswith(self._sync, at):
-                found = kept.find(self._sync, at)
+        buffered = self._kept
+        at = 0
+        while at < len(buffered):
+            if self._sync and not buffered.startswith(self._sync, at):
+                sync_place = buffered.find(self._sync, at)
                 # The last bytes may be the beginning of the sync bytes.
-                beyond = found if found >= 0 else max(at, len(kept) - len(self._sync) + 1)
-                yield from self._lose(bytes(kept[at:beyond]), "no sync bytes")
+                if sync_place >= 0:
+                    beyond = sync_place
+                else:
+                    beyond = max(at, len(buffered) - len(self._sync) + 1)
+                yield from self._lose(bytes(buffered[at:beyond]), "no sync bytes")
                 at = beyond
-                if found < 0:
+                if sync_place < 0:
                     break
             size = self._size(at)
-            if size is None or (size > 0 and at + size > len(kept)):
+            if size is None or (size > 0 and at + size > len(buffered)):
                 break
-            body = bytes(kept[at : at + size])
-            wrong = "a length that no frame has" if size <= 0 else self._check(body)
+            body = bytes(buffered[at : at + size])
+            if size <= 0:
+                wrong = "a length that no frame has"
+            else:
+                wrong = self._check(body)
             if wrong and size > 0 and not self._certain:
                 wrong = ""
             if wrong:
-                yield from self._lose(body or bytes(kept[at : at + 1]), wrong)
+                yield from self._lose(body or bytes(buffered[at : at + 1]), wrong)
                 at += 1
                 continue
             self._silent_bytes = 0
             at += size
             yield Cut(body)
-        del kept[:at]
+        del buffered[:at]
 
     def _lose(self, raw: bytes, detail: str) -> Iterator[Cut]:
         """Say what was wrong: each wrong checksum after sync bytes, of other lost bytes the first
@@ -272,9 +293,9 @@ class Measured:
         Where nothing tells where a frame begins, each of a damaged one's bytes is tried.
         """
         of_checksum = "checksum" in detail
-        told = (of_checksum and bool(self._sync)) or self._silent_bytes <= 0
+        is_reported = (of_checksum and bool(self._sync)) or self._silent_bytes <= 0
         self._silent_bytes -= 1
-        if raw and told:
+        if raw and is_reported:
             self._silent_bytes = len(raw) - 1 if of_checksum else MAX_FRAME_BYTES
             yield Cut(raw, "checksum" if of_checksum else "framing", detail)
 
@@ -282,24 +303,25 @@ class Measured:
         """Bytes of the frame that begins there; 0 where none can, None where too few have come
         to tell.
         """
-        kept = self._kept
+        buffered = self._kept
         if self._ccsds:
-            if len(kept) - at < CCSDS_HEADER_BYTES:
+            if len(buffered) - at < CCSDS_HEADER_BYTES:
                 return None
-            size = CCSDS_HEADER_BYTES + 1 + int.from_bytes(kept[at + 4 : at + 6], "big")
-            wanted = self._length if isinstance(self._length, int) else size
-            return (
-                size
-                if not kept[at] & CCSDS_VERSION_MASK and size == wanted and size <= MAX_FRAME_BYTES
-                else 0
-            )
+            size = CCSDS_HEADER_BYTES + 1 + int.from_bytes(buffered[at + 4 : at + 6], "big")
+            if isinstance(self._length, int):
+                wanted = self._length
+            else:
+                wanted = size
+            if not buffered[at] & CCSDS_VERSION_MASK and size == wanted and size <= MAX_FRAME_BYTES:
+                return size
+            return 0
         if not isinstance(self._length, FrameLength):
             return self._length
         end = self._length.at + (field_format(self._length.type) or ("u", 1, False))[1]
-        if len(kept) - at < end:
+        if len(buffered) - at < end:
             return None
         size = (
-            int(raw_number(bytes(kept[at : at + end]), self._length.at, self._length.type))
+            int(raw_number(bytes(buffered[at : at + end]), self._length.at, self._length.type))
             + self._length.add
         )
         return size if end <= size <= MAX_FRAME_BYTES else 0
@@ -322,7 +344,7 @@ class FrameDecoder:
 
     def __init__(self, settings: AnswersSettings) -> None:
         self.settings = settings
-        self._matches = [(each.at, bytes.fromhex(each.hex)) for each in settings.match]
+        self._matches = [(match.at, bytes.fromhex(match.hex)) for match in settings.match]
 
     def fault(self, body: bytes) -> str:
         """What is wrong with a frame's checksum; "" where it is right, or there is none."""
@@ -330,17 +352,18 @@ class FrameDecoder:
         if settings.checksum == "none":
             return ""
         calculate, size = CHECKSUMS[settings.checksum]
-        at = -size if settings.checksum_at is None else settings.checksum_at
+        if settings.checksum_at is None:
+            at = -size
+        else:
+            at = settings.checksum_at
         at += len(body) if at < 0 else 0
         if at < settings.checksum_from or at + size > len(body):
             return f"too short for its checksum: {len(body)} bytes"
-        found = int.from_bytes(body[at : at + size], settings.checksum_order)
+        stated = int.from_bytes(body[at : at + size], settings.checksum_order)
         wanted = calculate(body[settings.checksum_from : at])
-        return (
-            ""
-            if found == wanted
-            else f"the {settings.checksum} checksum is {found:#x}, and {wanted:#x} by the bytes"
-        )
+        if stated == wanted:
+            return ""
+        return f"the {settings.checksum} checksum is {stated:#x}, and {wanted:#x} by the bytes"
 
     def decoded(self, body: bytes) -> JsonAnswer | RefusedAnswer:
         """What a frame says."""
@@ -349,12 +372,12 @@ class FrameDecoder:
         if any(body[at : at + len(wanted)] != wanted for at, wanted in self._matches):
             return RefusedAnswer("other", "a frame of another kind ([answers] match)", body)
         try:
-            found: dict[str, int | float] = {
-                field.name: self.value(body, field) for field in self.settings.fields
-            }
+            values: dict[str, int | float] = {}
+            for field in self.settings.fields:
+                values[field.name] = self.value(body, field)
         except IndexError as error:
             return RefusedAnswer("length", f"a field needs {error}", body)
-        return said_by(found, body)
+        return said_by(values, body)
 
     def value(self, body: bytes, field: FrameField) -> int | float:
         """The value of a field: whole where neither scale nor sum says otherwise. Raises
@@ -371,7 +394,10 @@ class FrameDecoder:
 def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | RefusedAnswer:
     """An answer of the named numbers of a frame."""
     q = tuple(float(found[name]) for name in ("qw", "qx", "qy", "qz"))
-    rate = tuple(float(found[name]) for name in ("wx", "wy", "wz")) if "wx" in found else None
+    if "wx" in found:
+        rate = tuple(float(found[name]) for name in ("wx", "wy", "wz"))
+    else:
+        rate = None
     # Each by itself: whole seconds and a fraction stay exact.
     times_ns = [
         found[name] * unit_ns
@@ -381,7 +407,8 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
     if not all(map(math.isfinite, times_ns)):
         return RefusedAnswer("nan", "its time is not finite", body)
     t_ns = sum(map(round, times_ns)) if times_ns else None
-    stars, mode = found.get("stars"), found.get("mode")
+    stars = found.get("stars")
+    mode = found.get("mode")
     if not all(number is None or math.isfinite(number) for number in (stars, mode)):
         stars = mode = None
     valid = "valid" not in found or (math.isfinite(found["valid"]) and found["valid"] != 0)
@@ -411,9 +438,11 @@ class AnswerDecoder:
         messages: bool,
         folder: Path | None = None,
     ) -> None:
-        self.settings, self.q_body_to_cam = settings, q_body_to_cam
+        self.settings = settings
+        self.q_body_to_cam = q_body_to_cam
         self.sent = SentAttitudes(settings.convention, Mounting(q_body_to_cam))
-        self._messages, self._last_ns = messages, 0
+        self._messages = messages
+        self._last_ns = 0
         self.frames = FrameDecoder(settings)
         self._function = _load(settings, folder) if settings.format.startswith(PREFIX) else None
         self._cutter = self._make_cutter()
@@ -436,7 +465,7 @@ class AnswerDecoder:
         """What `chunk` completes, which came at a host time, ns."""
         cutter = self._cutter
         if cutter is None:
-            return [self._answer(host_ns, said, chunk) for said in self._said(chunk)]
+            return [self._answer(host_ns, statement, chunk) for statement in self._said(chunk)]
         cuts = cutter.cut(chunk + self._end() if self._messages else chunk)
         # A program that writes a file may leave a frame in two for as long as it likes.
         if (
@@ -446,13 +475,15 @@ class AnswerDecoder:
         ):
             cuts = chain(cutter.pause(), cuts)
         self._last_ns = host_ns
-        found: list[Answer | RefusedAnswer] = []
+        answers: list[Answer | RefusedAnswer] = []
         for cut in cuts:
             if cut.reason:
-                found.append(RefusedAnswer(cut.reason, cut.detail, cut.body))
+                answers.append(RefusedAnswer(cut.reason, cut.detail, cut.body))
             else:
-                found += [self._answer(host_ns, said, cut.body) for said in self._said(cut.body)]
-        return found
+                answers += [
+                    self._answer(host_ns, statement, cut.body) for statement in self._said(cut.body)
+                ]
+        return answers
 
     def _end(self) -> bytes:
         """A message over UDP or ZeroMQ need not have the end that its framing has on a line."""
@@ -461,7 +492,9 @@ class AnswerDecoder:
     def _answer(
         self, host_ns: int, said: JsonAnswer | RefusedAnswer, raw: bytes
     ) -> Answer | RefusedAnswer:
-        return said if isinstance(said, RefusedAnswer) else answer_of(self.sent, host_ns, raw, said)
+        if isinstance(said, RefusedAnswer):
+            return said
+        return answer_of(self.sent, host_ns, raw, said)
 
     def _said(self, body: bytes) -> Iterable[JsonAnswer | RefusedAnswer]:
         if self._function is not None:
@@ -474,21 +507,24 @@ class AnswerDecoder:
 
 
 def _of_packet(body: bytes) -> JsonAnswer | RefusedAnswer:
-    found = decode(body)
-    if isinstance(found, Refusal):
+    event = decode(body)
+    if isinstance(event, Refusal):
         return RefusedAnswer(
-            found.reason, found.detail.replace("an attitude of 64", "an answer of 68"), body
+            event.reason, event.detail.replace("an attitude of 64", "an answer of 68"), body
         )
-    if not isinstance(found, AnswerPacket):
+    if not isinstance(event, AnswerPacket):
         return RefusedAnswer(
             "format", f"a packet of another kind; send kind {protocol.KIND_ANSWER}", body
         )
-    w, x, y, z = found.q_icrs_to_cam
-    rx, ry, rz = found.rate_cam_rad_s
-    rate = (rx, ry, rz) if found.flags & protocol.ANSWER_RATE_VALID else None
-    mode = next((word for bit, word in MODES if found.flags & bit), "")
+    w, x, y, z = event.q_icrs_to_cam
+    rx, ry, rz = event.rate_cam_rad_s
+    if event.flags & protocol.ANSWER_RATE_VALID:
+        rate = (rx, ry, rz)
+    else:
+        rate = None
+    mode = next((word for bit, word in MODES if event.flags & bit), "")
     return JsonAnswer(
-        found.t_ns, (w, x, y, z), rate, bool(found.flags & protocol.ANSWER_VALID), mode, found.stars
+        event.t_ns, (w, x, y, z), rate, bool(event.flags & protocol.ANSWER_VALID), mode, event.stars
     )
 
 
@@ -512,9 +548,9 @@ def _load(settings: AnswersSettings, folder: Path | None) -> Callable[[bytes], A
     try:
         return user_function(settings.format, folder or Path(), settings.trust)
     except UserCodeError as error:
-        said = f'[answers] format = "{settings.format}": {error}'
+        refusal = f'[answers] format = "{settings.format}": {error}'
         raise InputError(
-            f"{one_line(said)}; name a module beside the bench file and its function"
+            f"{one_line(refusal)}; name a module beside the bench file and its function"
         ) from error
 
 
@@ -523,9 +559,9 @@ def _of_function(
 ) -> Iterator[JsonAnswer | RefusedAnswer]:
     """The answers of a user's function: a dictionary each, as the JSON object."""
     try:
-        for said in function(chunk) or ():
+        for statement in function(chunk) or ():
             try:
-                yield msgspec.convert(said, JsonAnswer, strict=False, builtin_types=())
+                yield msgspec.convert(statement, JsonAnswer, strict=False, builtin_types=())
             except msgspec.ValidationError as error:
                 yield RefusedAnswer("format", f"the function gave {error}", chunk)
     except Exception as error:  # a user's code: its fault is told as any other bytes'

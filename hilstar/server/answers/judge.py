@@ -72,10 +72,14 @@ class AnswerRules:
     @classmethod
     def of(cls, config: "BenchConfig") -> Self:
         """Those of a bench file; the defaults for one without `[answers]`."""
-        settings, exposure_s = config.answers, config.tracker.exposure_s
+        settings = config.answers
+        exposure_s = config.tracker.exposure_s
         if settings is None:
             return cls(exposure_s)
-        latency_s = None if settings.latency_ms is None else settings.latency_ms / 1e3
+        if settings.latency_ms is None:
+            latency_s = None
+        else:
+            latency_s = settings.latency_ms / 1e3
         return cls(exposure_s, settings.stamp, settings.clock, settings.wrong_arcsec, latency_s)
 
 
@@ -142,8 +146,10 @@ class AnswerTimes:
     def __init__(
         self, rules: AnswerRules, unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset
     ) -> None:
-        self._rules, self._unix_offset = rules, unix_offset
-        self._known, self._known_ns = UnixOffset(0, 0), -KNOWN_AGAIN_NS
+        self._rules = rules
+        self._unix_offset = unix_offset
+        self._known = UnixOffset(0, 0)
+        self._known_ns = -KNOWN_AGAIN_NS
         self._clock = SenderClock()
         self._late = 0
         self.order = StampOrder()
@@ -160,7 +166,8 @@ class AnswerTimes:
 
     def give_up(self) -> None:
         """Go back to the guess: under the delay that was found, answers are not right."""
-        self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S
+        self.delay_s = self.guess_s
+        self.sigma_s = GUESSED_SIGMA_S
 
     def middle(self, answer: Answer) -> tuple[int, float]:
         """The middle of the exposure, host time, ns, and its sigma, s."""
@@ -174,12 +181,14 @@ class AnswerTimes:
             return t_ns, 0.0
         if rules.clock == "unix":
             if answer.host_ns - self._known_ns >= KNOWN_AGAIN_NS:
-                self._known, self._known_ns = self._unix_offset(), answer.host_ns
+                self._known = self._unix_offset()
+                self._known_ns = answer.host_ns
             return t_ns + self._known.offset_ns, self._known.error_ns / NS_PER_S
         late_ns = self._clock.latency_ns(t_ns, answer.host_ns)
         self._late = self._late + 1 if late_ns is not None and late_ns > JUMP_NS else 0
         if self._late == JUMPS:
-            self._clock, self._late = SenderClock(), 0
+            self._clock = SenderClock()
+            self._late = 0
         self._clock.observe(t_ns, answer.host_ns)
         late_ns = max(self._clock.latency_ns(t_ns, answer.host_ns) or 0.0, 0.0)
         known_ms = self._clock.summary().uncertainty_ms
@@ -224,7 +233,8 @@ def fitted_delay(
             variance = np.linalg.inv(normal)[3, 3]
         except np.linalg.LinAlgError:
             return None
-        off, near_before = error_arcsec - design @ fitted, near
+        off = error_arcsec - design @ fitted
+        near_before = near
         if not (np.isfinite(off).all() and np.isfinite(variance) and variance >= 0):
             return None
     return DelayFit(float(fitted[3]), float(np.sqrt(variance)))
@@ -236,7 +246,8 @@ class AnswerJudge:
     def __init__(self, rules: AnswerRules, frames: LitFrames) -> None:
         self.counts: Counter[Verdict] = Counter()
         self.times = AnswerTimes(rules)
-        self._rules, self._frames = rules, frames
+        self._rules = rules
+        self._frames = frames
         self._rows = np.zeros((MAX_IN_WINDOW, COLUMNS))
         self._count = 0
         self._fitted_ns = 0
@@ -257,18 +268,18 @@ class AnswerJudge:
                 verdict = self._verdict(residual, lit, sigma_s)
         if verdict == "unjudged":
             lit = residual = None
-        found = Judged(answer, verdict, middle_ns, sigma_s, lit, residual)
-        self._keep(found)
+        judged = Judged(answer, verdict, middle_ns, sigma_s, lit, residual)
+        self._keep(judged)
         if self.times.fits and abs(answer.host_ns - self._fitted_ns) > FIT_EACH_NS:
             self._fitted_ns = answer.host_ns
             self._fit(answer.host_ns)
-        return found
+        return judged
 
     def pass_over(self, answer: Answer) -> Judged:
         """An answer that judging failed on: it is counted, and compared with nothing."""
-        found = unjudged(answer)
-        self._keep(found)
-        return found
+        judged = unjudged(answer)
+        self._keep(judged)
+        return judged
 
     def _verdict(self, residual: FloatArray, lit: Lit, sigma_s: float) -> Verdict:
         """Whether a residual is an attitude of the sky that was lit, by a time known to
@@ -301,16 +312,16 @@ class AnswerJudge:
 
     def _lately(self, now_ns: int) -> FloatArray:
         at = self._count % MAX_IN_WINDOW
-        rows = (
-            self._rows[: self._count]
-            if self._count < MAX_IN_WINDOW
-            else np.roll(self._rows, -at, axis=0)
-        )
+        if self._count < MAX_IN_WINDOW:
+            rows = self._rows[: self._count]
+        else:
+            rows = np.roll(self._rows, -at, axis=0)
         return rows[rows[:, HOST_S] >= now_ns / NS_PER_S - WINDOW_S]
 
     def _fit(self, now_ns: int) -> None:
         """Find the delay, together with the bias, from the last minute's right answers."""
-        rows, times = self._lately(now_ns), self.times
+        rows = self._lately(now_ns)
+        times = self.times
         right = rows[rows[:, VERDICT] == VERDICTS.index("right")]
         if len(right) < MIN_FITTED:
             wrong = rows[:, VERDICT] == VERDICTS.index("wrong")
@@ -319,11 +330,11 @@ class AnswerJudge:
                 times.give_up()
                 self._turn_errors(times.delay_s - before_s)
             return
-        found = fitted_delay(right[:, ERROR], right[:, RATE], times.guess_s - times.delay_s)
-        if found is None or times.delay_s + found.shift_s > max(MAX_DELAY_S, times.guess_s):
+        delay_fit = fitted_delay(right[:, ERROR], right[:, RATE], times.guess_s - times.delay_s)
+        if delay_fit is None or times.delay_s + delay_fit.shift_s > max(MAX_DELAY_S, times.guess_s):
             return
-        shift_s = max(found.shift_s, self._rules.exposure_s / 2 - times.delay_s)
-        times.shift(DelayFit(shift_s, found.sigma_s))
+        shift_s = max(delay_fit.shift_s, self._rules.exposure_s / 2 - times.delay_s)
+        times.shift(DelayFit(shift_s, delay_fit.sigma_s))
         self._turn_errors(shift_s)
 
     def _turn_errors(self, shift_s: float) -> None:
@@ -337,60 +348,66 @@ class AnswerJudge:
         `trouble` is what is wrong with the tracker's line.
         """
         self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
-        rows, newest = self._lately(now_ns), self._newest
-        told: dict[str, Any] = {verdict: self.counts[verdict] for verdict in VERDICTS}
-        told["out_of_order"] = self.times.order.fallen
+        rows = self._lately(now_ns)
+        newest = self._newest
+        figure_values: dict[str, Any] = {verdict: self.counts[verdict] for verdict in VERDICTS}
+        figure_values["out_of_order"] = self.times.order.fallen
         cycle_s = cycle_of(rows[:, HOST_S])
         since_s = (
             now_ns - (self._begun_ns if newest is None else newest.answer.host_ns)
         ) / NS_PER_S
-        limit_s = FIRST_S if newest is None else max(SILENT_S, SILENT_CYCLES * (cycle_s or 0.0))
+        if newest is None:
+            limit_s = FIRST_S
+        else:
+            limit_s = max(SILENT_S, SILENT_CYCLES * (cycle_s or 0.0))
         if newest is not None:
             late_s = (newest.answer.host_ns - newest.middle_ns) / NS_PER_S
-            told |= {
+            figure_values |= {
                 "mode": newest.answer.mode,
                 "stars": newest.answer.star_count,
                 "verdict": newest.verdict,
             }
-            told |= {
+            figure_values |= {
                 "latency_ms": round(1e3 * late_s, 3),
                 "latency_sigma_ms": round(1e3 * newest.sigma_s, 3),
             }
-            told |= {
+            figure_values |= {
                 "residual_arcsec": None if newest.residual is None else _rounded(newest.residual),
                 "age_s": round(since_s, 3),
             }
         error = rows[rows[:, VERDICT] == 0][:, ERROR]
         if len(error):
-            told |= {
+            figure_values |= {
                 "mean_arcsec": _rounded(error.mean(axis=0)),
                 "rms_arcsec": _rounded(np.sqrt((error**2).mean(axis=0))),
             }
         if len(error) > 1:
-            told |= {"sigma3_arcsec": _rounded(3 * error.std(axis=0, ddof=1))}
+            figure_values |= {"sigma3_arcsec": _rounded(3 * error.std(axis=0, ddof=1))}
         if cycle_s is not None:  # arrivals jitter by less than half a cycle
             dark_s = self._frames.dark_ns / NS_PER_S - rows[0, DARK_S]
             due = math.floor((now_ns / NS_PER_S - rows[0, HOST_S] - dark_s) / cycle_s - 0.5) + 1
-            told |= {
+            figure_values |= {
                 "rate_hz": round(1 / cycle_s, 3),
                 "availability": round(min(len(error) / max(due, 1), 1.0), 4),
             }
-        words = "the tracker has not answered" + (
+        silence_text = "the tracker has not answered" + (
             " yet" if newest is None else f" for {since_s:.1f} s"
         )
-        words += f" ({trouble})" if trouble else ""
+        silence_text += f" ({trouble})" if trouble else ""
         return TrackerFigures(
             answers=sum(self.counts.values()),
             refused=refused,
-            silent=words if since_s > limit_s else "",
+            silent=silence_text if since_s > limit_s else "",
             trouble=trouble,
-            **told,
+            **figure_values,
         )
 
 
 def cycle_of(at_s: FloatArray) -> float | None:
     """The usual time between answers at rising times (n,), s; None for fewer than three."""
-    return max(float(np.median(np.diff(at_s))), 1e-4) if len(at_s) > 2 else None
+    if len(at_s) > 2:
+        return max(float(np.median(np.diff(at_s))), 1e-4)
+    return None
 
 
 def _rounded(values: FloatArray) -> list[float]:

@@ -65,7 +65,8 @@ class LitFrames:
     def __init__(self, period_ns: float, hold_s: float = 0.0, *, centred: bool = True) -> None:
         self.dark_ns = 0  # how long no sky was shown
         self._frames: deque[LitFrame] = deque(maxlen=max(16, int(KEPT_NS / period_ns)))
-        self._hold_s, self._early_ns = hold_s, round(period_ns / 2) if centred else 0
+        self._hold_s = hold_s
+        self._early_ns = round(period_ns / 2) if centred else 0
 
     def add(self, frame: LitFrame) -> None:
         """Add the newest frame."""
@@ -91,15 +92,19 @@ class LitFrames:
         last = first
         while last + 1 < len(frames) and self._begin_ns(frames[last + 1]) < end_ns:
             last += 1
-        kept, lit_ns, whole_ns = [], [], 0
+        kept = []
+        lit_ns = []
+        whole_ns = 0
         for k in range(first, last + 1):
             begin_ns = self._begin_ns(frames[k])
-            gone_ns = (
-                self._begin_ns(frames[k + 1]) if k + 1 < len(frames) else begin_ns + MAX_HELD_NS
-            )
-            overlap_ns = (
-                max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0) if end_ns > start_ns else 1
-            )
+            if k + 1 < len(frames):
+                gone_ns = self._begin_ns(frames[k + 1])
+            else:
+                gone_ns = begin_ns + MAX_HELD_NS
+            if end_ns > start_ns:
+                overlap_ns = max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0)
+            else:
+                overlap_ns = 1
             if frames[k].q is not None and overlap_ns:
                 kept.append(k)
                 lit_ns.append(overlap_ns)
@@ -120,11 +125,10 @@ class LitFrames:
         a jump.
         """
         # The rate needs two frames: of a short exposure a neighbour too.
-        near = (
-            kept
-            if len(kept) > 1
-            else [k for k in (kept[0] - 1, kept[0], kept[0] + 1) if 0 <= k < len(frames)]
-        )
+        if len(kept) > 1:
+            near = kept
+        else:
+            near = [k for k in (kept[0] - 1, kept[0], kept[0] + 1) if 0 <= k < len(frames)]
         near = [k for k in near if frames[k].q is not None]
         q = np.array([self._shown(frames[k]) for k in near])
         turned = to_rotation_vector(multiply(q, conjugate(q[:1])))
@@ -134,11 +138,10 @@ class LitFrames:
         at_s = np.array([(frames[k].host_ns - middle_ns) / NS_PER_S for k in near])
         spread_s = at_s - at_s.mean()
         power = float(spread_s @ spread_s)
-        rate = (
-            -(spread_s @ turned) / power
-            if power and (not len(steps) or steps.max() <= MAX_STEP_RAD)
-            else np.zeros(3)
-        )
+        if power and (not len(steps) or steps.max() <= MAX_STEP_RAD):
+            rate = -(spread_s @ turned) / power
+        else:
+            rate = np.zeros(3)
         inside = [near.index(k) for k in kept]
         mean = lit_ns @ turned[inside] / lit_ns.sum()
         nearest = min((frames[k] for k in kept), key=lambda frame: abs(frame.host_ns - middle_ns))
@@ -151,11 +154,9 @@ class LitFrames:
         its light.
         """
         assert frame.q is not None
-        return (
-            frame.q
-            if frame.rate_rad_s is None
-            else propagate(frame.q, frame.rate_rad_s, self._hold_s / 2)
-        )
+        if frame.rate_rad_s is None:
+            return frame.q
+        return propagate(frame.q, frame.rate_rad_s, self._hold_s / 2)
 
 
 def residual_arcsec(reported: FloatArray, lit: FloatArray) -> FloatArray:

@@ -93,7 +93,8 @@ class ReadPlan:
         if settings.source == "zmq":
             names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
             keys = CurveKeys(*(None if name is None else self.folder / name for name in names))
-            endpoint, bind = settings.endpoint or ZMQ_ENDPOINT, settings.bind is True
+            endpoint = settings.endpoint or ZMQ_ENDPOINT
+            bind = settings.bind is True
             try:
                 return ZmqBytes(
                     ZmqReceiver(endpoint, bind=bind, keys=keys, notices=notices), notices
@@ -128,18 +129,17 @@ class DecodingLink:
     """
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self._link, self._clock = plan.open(notices), clock
+        self._link = plan.open(notices)
+        self._clock = clock
         self.link_counts = self._link.link_counts
         self._decoder = plan.decoder(self._link.messages)
         settings = plan.settings
         self._question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
         self._period_s = 1 / settings.poll_hz
         self._next_question = clock.within(0.0)
-        self._bytes_left, self._answers_left, self._work_left_s = (
-            float(MAX_BURST_BYTES),
-            float(MAX_ANSWERS_PER_S),
-            MAX_WORK_S,
-        )
+        self._bytes_left = float(MAX_BURST_BYTES)
+        self._answers_left = float(MAX_ANSWERS_PER_S)
+        self._work_left_s = MAX_WORK_S
         self._seen_ns = clock.now_ns()
         self._trouble: str | None = None
 
@@ -170,16 +170,16 @@ class DecodingLink:
                 continue
             self._bytes_left -= len(data)
             begun_ns = self._clock.now_ns()
-            for found in self._decoder.feed(chunk.host_ns, data):
-                if isinstance(found, RefusedAnswer):
-                    refused[found.reason] += 1
-                    details[found.reason] = found.detail
+            for answer in self._decoder.feed(chunk.host_ns, data):
+                if isinstance(answer, RefusedAnswer):
+                    refused[answer.reason] += 1
+                    details[answer.reason] = answer.detail
                 elif self._answers_left < 1:
                     refused[FLOOD] += 1
                     details[FLOOD] = f"over {MAX_ANSWERS_PER_S} answers a second"
                 else:
                     self._answers_left -= 1
-                    given.append(chunk._replace(parts=[hand_over(HandedOver(found))], sender=None))
+                    given.append(chunk._replace(parts=[hand_over(HandedOver(answer))], sender=None))
             self._work_left_s -= (self._clock.now_ns() - begun_ns) / NS_PER_S
         if refused:
             given.append(
@@ -189,7 +189,8 @@ class DecodingLink:
         return given + self._new_trouble(now_ns)
 
     def _refill(self, now_ns: int) -> None:
-        passed_s, self._seen_ns = (now_ns - self._seen_ns) / NS_PER_S, now_ns
+        passed_s = (now_ns - self._seen_ns) / NS_PER_S
+        self._seen_ns = now_ns
         self._bytes_left = min(self._bytes_left + passed_s * MAX_BYTES_PER_S, MAX_BURST_BYTES)
         self._answers_left = min(
             self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S
@@ -206,7 +207,10 @@ class DecodingLink:
     def _pieces(self, chunks: list[RawMessage]) -> Iterator[tuple[RawMessage, bytes]]:
         for chunk in chunks:
             data = chunk.parts[-1]
-            size = max(len(data), 1) if self._link.messages else PIECE_BYTES
+            if self._link.messages:
+                size = max(len(data), 1)
+            else:
+                size = PIECE_BYTES
             for at in range(0, len(data), size):
                 yield chunk, data[at : at + size]
 
@@ -224,7 +228,8 @@ class AnswersApart(Closing):
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         with plan.open_first(notices) as tried:
-            self.endpoint, messages = tried.endpoint, tried.messages
+            self.endpoint = tried.endpoint
+            messages = tried.messages
         plan.decoder(messages)
         self._refused: Counter[str] = Counter()
         self.details: dict[str, str] = {}
@@ -250,18 +255,18 @@ class AnswersApart(Closing):
         """The answers since the last call, oldest first; waits at most `timeout_ms` for the
         first.
         """
-        found: list[Answer] = []
+        answers: list[Answer] = []
         for record in self._process.take() if self._process.wait(timeout_ms) else ():
             if record.message is None:
                 continue
-            said = handed_over(record.message.parts[0])
-            if said.answer is not None:
-                found.append(said.answer)
-            self._refused.update(said.refused)
-            if said.trouble is not None:
-                self._trouble = said.trouble
-            self.details = dict(list({**self.details, **said.details}.items())[-MAX_DETAILS:])
-        return found
+            handed = handed_over(record.message.parts[0])
+            if handed.answer is not None:
+                answers.append(handed.answer)
+            self._refused.update(handed.refused)
+            if handed.trouble is not None:
+                self._trouble = handed.trouble
+            self.details = dict(list({**self.details, **handed.details}.items())[-MAX_DETAILS:])
+        return answers
 
     def refusals(self) -> dict[str, int]:
         """How much was refused so far, by reason."""
@@ -298,8 +303,12 @@ def live_answers(
     """The answers of an open road, read in this process for so long; the tracker is asked where
     it has to be.
     """
-    settings, begun_ns = plan.settings, clock.now_ns()
-    question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
+    settings = plan.settings
+    begun_ns = clock.now_ns()
+    if settings.poll_hex is None:
+        question = None
+    else:
+        question = bytes.fromhex(settings.poll_hex)
     due = clock.within(0.0)
     while not stopped() and clock.now_ns() - begun_ns < seconds * NS_PER_S:
         if question is not None and due.over:

@@ -123,7 +123,9 @@ def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
     """The file for a moment that a person names: its stars are those of that day where t_ns
     counts from 1970.
     """
-    return file if t_ns is None or file.config.sky.epoch_utc != UNIX else dated(file, None, t_ns)
+    if t_ns is None or file.config.sky.epoch_utc != UNIX:
+        return file
+    return dated(file, None, t_ns)
 
 
 def stated_in(config: BenchConfig) -> "Stated":
@@ -132,7 +134,10 @@ def stated_in(config: BenchConfig) -> "Stated":
     """
     from hilstar.attitude.logs.entries import Stated
 
-    convention = None if config.attitude.convention == HILSTARS else config.attitude.convention
+    if config.attitude.convention == HILSTARS:
+        convention = None
+    else:
+        convention = config.attitude.convention
     return Stated(
         Mounting(config.tracker.q_body_to_cam),
         convention=convention,
@@ -218,7 +223,9 @@ def read_bench_or_heads(path: Path) -> BenchFile | HeadsFile:
     """
     text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
     tables = parse_toml(path, text)
-    return _heads_of(path, tables) if HEADS in tables else bench_file_of(path, text)
+    if HEADS in tables:
+        return _heads_of(path, tables)
+    return bench_file_of(path, text)
 
 
 def _tables(path: Path) -> dict[str, Any]:
@@ -316,7 +323,10 @@ def with_key(
     if header is None:
         return f"{text.rstrip()}\n\n[{table}]\n{line}\n".lstrip()
     following = re.search(r"^[ \t]*\[", text[header.end() :], re.MULTILINE)
-    end = header.end() + following.start() if following else len(text)
+    if following:
+        end = header.end() + following.start()
+    else:
+        end = len(text)
     names = "|".join((key, *instead_of))
     there = re.compile(rf"^([ \t]*)(?:{names})[ \t]*=[^\n#]*?([ \t]*#[^\n]*)?$", re.MULTILINE)
     body, count = there.subn(rf"\g<1>{line}\g<2>", text[header.end() : end], count=1)

@@ -120,8 +120,10 @@ def display_psfs(
         yield GaussianPsf(render.sprite_sigma_px), None
         return
     tracker = replace(config.tracker, effort="full")
-    optics, camera = tracker.optics, tracker_camera(tracker, folder)
-    own, onto = tracker_psf(tracker, folder), Onto(display, camera)
+    optics = tracker.optics
+    camera = tracker_camera(tracker, folder)
+    tracker_own = tracker_psf(tracker, folder)
+    onto = Onto(display, camera)
     x_px, y_px = camera.grid_px(FIELD_PLACES)
     places_px = onto.places_px(np.stack([x_px, y_px], axis=1))
     if not np.isfinite(places_px).all():
@@ -130,8 +132,8 @@ def display_psfs(
             " q_cam_to_mon"
         )
     try:
-        if isinstance(own, GaussianPsf):
-            spread = onto.matrix @ np.diag(np.square(own.sigma_px)) @ onto.matrix.T
+        if isinstance(tracker_own, GaussianPsf):
+            spread = onto.matrix @ np.diag(np.square(tracker_own.sigma_px)) @ onto.matrix.T
             if abs(spread[0, 1]) > OBLIQUE * spread.trace():
                 raise InputError(
                     "its Gaussian is oval and lies obliquely on the display; give [tracker.optics]"
@@ -139,7 +141,7 @@ def display_psfs(
                 )
             yield GaussianPsf((math.sqrt(spread[0, 0]), math.sqrt(spread[1, 1]))), None
             return
-        if isinstance(own, SampledPsf) and own.pixel_integrated:
+        if isinstance(tracker_own, SampledPsf) and tracker_own.pixel_integrated:
             raise InputError(
                 "it has the tracker's pixel in it (PIXINT), which the detector adds again; give one"
                 " without"
@@ -151,7 +153,10 @@ def display_psfs(
             image = read_psf(folder / optics.psf)
             samples, per_px = regridded(image.samples[None], image.per_px, onto.matrix)
             drawn = SampledPsf(samples[0], per_px)
-        among = None if render.effort == "auto" else frozenset((ONE_PSF, WHOLE))
+        if render.effort == "auto":
+            among = None
+        else:
+            among = frozenset((ONE_PSF, WHOLE))
         yield from psf_choices(drawn, places_px, among)
     except InputError as error:
         raise InputError(f'[render] psf = "tracker", with {optics.psf}: {error}') from error
@@ -184,18 +189,17 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
             f"psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}", "[tracker]"
         )
     glass = glass_in(tracker, folder)
-    own = (
-        read_psf(folder / tracker.optics.psf)
-        if glass is None
-        else bench_glass_psf(glass, tracker, folder)
-    )
+    if glass is None:
+        whole_psf = read_psf(folder / tracker.optics.psf)
+    else:
+        whole_psf = bench_glass_psf(glass, tracker, folder)
     if tracker.effort == "full":
-        return own
-    found, choice = least_tracker_psf(
-        own, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
+        return whole_psf
+    least, choice = least_tracker_psf(
+        whole_psf, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
     )
     say_once(choice.line(), "[tracker] effort")
-    return found
+    return least
 
 
 @lru_cache(maxsize=4)
@@ -248,11 +252,9 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     if tracker.distortion is not None:
         camera = load_distortion(path, camera)
     camera = through_glass(camera, tracker, folder)
-    return (
-        camera
-        if camera.lens is None
-        else _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
-    )
+    if camera.lens is None:
+        return camera
+    return _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
 
 
 def flight_camera(tracker: Tracker, folder: Path, true: Camera) -> Camera:
@@ -265,11 +267,9 @@ def flight_camera(tracker: Tracker, folder: Path, true: Camera) -> Camera:
         decentre_x_um=0.0,
         decentre_y_um=0.0,
     )
-    return (
-        true
-        if optics == tracker.optics
-        else tracker_camera(replace(tracker, optics=optics), folder)
-    )
+    if optics == tracker.optics:
+        return true
+    return tracker_camera(replace(tracker, optics=optics), folder)
 
 
 def _bounded(camera: Camera, margin_px: float, path: Path) -> Camera:
@@ -300,7 +300,10 @@ class FieldsOfView:
         screen, tracker = (
             [figure(side) for side in sides] for sides in (self.screen_deg, self.tracker_deg)
         )
-        across = tracker[0] if tracker[0] == tracker[1] else " x ".join(tracker)
+        if tracker[0] == tracker[1]:
+            across = tracker[0]
+        else:
+            across = " x ".join(tracker)
         pixel = figure(self.tracker_px_a_monitor_px)
         return (
             f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a"
@@ -316,21 +319,21 @@ def fields_of_view(config: BenchConfig, folder: Path) -> FieldsOfView:
     """The fields of view of a bench's screen and tracker, with a warning where a length cannot
     be right. Raises InputError.
     """
-    found = _measured(config, folder)
-    odd = list(_oddities(config, found))
+    fields = _measured(config, folder)
+    odd = list(_oddities(config, fields))
     if not odd:
-        return found
-    mends = _mends(config, folder, sum(one.decades for one in odd))[:MAX_MENDS]
-    advice = (
-        f"is {', or '.join(mends)}?"
-        if mends
-        else "check the units of its lengths (_mm, _um) and its resolutions"
-    )
-    return dataclasses.replace(found, warning=f"{odd[0].text}; {advice}")
+        return fields
+    mends = _mends(config, folder, sum(oddity.decades for oddity in odd))[:MAX_MENDS]
+    if mends:
+        advice = f"is {', or '.join(mends)}?"
+    else:
+        advice = "check the units of its lengths (_mm, _um) and its resolutions"
+    return dataclasses.replace(fields, warning=f"{odd[0].text}; {advice}")
 
 
 def _measured(config: BenchConfig, folder: Path) -> FieldsOfView:
-    screen, tracker = bench_camera(config, folder), tracker_camera(config.tracker, folder)
+    screen = bench_camera(config, folder)
+    tracker = tracker_camera(config.tracker, folder)
     return FieldsOfView(
         screen_deg=_sides_deg(screen),
         tracker_deg=_sides_deg(tracker),
@@ -343,12 +346,13 @@ def _measured(config: BenchConfig, folder: Path) -> FieldsOfView:
 def _sides_deg(camera: Camera) -> tuple[float, float]:
     """The angles between the middles of the left and right, and of the top and bottom edge."""
     width, height = camera.resolution_px
-    x, y = (width - 1) / 2, (height - 1) / 2
+    x = (width - 1) / 2
+    y = (height - 1) / 2
     places = np.array([(-0.5, y), (width - 0.5, y), (x, -0.5), (x, height - 0.5)])
     rays = camera.rays(*places.T)
-    angles = [
-        math.atan2(np.linalg.norm(np.cross(a, b)), float(a @ b)) for a, b in (rays[:2], rays[2:])
-    ]
+    angles = []
+    for a, b in (rays[:2], rays[2:]):
+        angles.append(math.atan2(np.linalg.norm(np.cross(a, b)), float(a @ b)))
     # beyond a lens that is known so far
     sides = [2 * math.atan(size / 2 / camera.focal_length_px) for size in (width, height)]
     across, down = (
@@ -383,8 +387,11 @@ def _decades_outside(value: float, limits: tuple[float, float]) -> float:
 
 def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
     """Lengths that cannot be right, the plainest first."""
-    tracker, monitor, verify = config.tracker, config.monitor, config.verify
-    pixels, widest_deg = found.tracker_px_a_monitor_px, max(*found.screen_deg, *found.tracker_deg)
+    tracker = config.tracker
+    monitor = config.monitor
+    verify = config.verify
+    pixels = found.tracker_px_a_monitor_px
+    widest_deg = max(*found.screen_deg, *found.tracker_deg)
     past = (
         f"the tracker sees past the screen: {_percent(found.field_on_screen)} of its field is on it"
         f" ({found.line()})"
@@ -419,13 +426,13 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
             (TINY, math.tan(math.radians(MAX_FIELD_DEG) / 2)),
         )
     )
-    for key, true, said in (
+    for key, true, stated in (
         ("true_focal_length_mm", verify.true_focal_length_mm, config.collimator.focal_length_mm),
         ("true_pixel_pitch_um", verify.true_pixel_pitch_um, monitor.pixel_pitch_um),
     ):
         if true is not None:
-            text = f"[verify] {key} is {true:.6g}, and elsewhere this file says {said:.6g}"
-            judged.append((text, true / said, TRUE_RATIOS))
+            text = f"[verify] {key} is {true:.6g}, and elsewhere this file says {stated:.6g}"
+            judged.append((text, true / stated, TRUE_RATIOS))
     for text, value, limits in judged:
         decades = _decades_outside(value, limits)
         if decades > 0:
@@ -448,7 +455,10 @@ def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
         except InputError:  # such a lens leaves the screen
             continue
     smallest = min(rest_decades.values(), default=math.inf)
-    limit = 0.0 if smallest == 0 else min(MAX_LEFT * decades, smallest + AS_GOOD)
+    if smallest == 0:
+        limit = 0.0
+    else:
+        limit = min(MAX_LEFT * decades, smallest + AS_GOOD)
     return [text for text, rest in rest_decades.items() if rest <= limit]
 
 
@@ -476,9 +486,11 @@ def _readings(config: BenchConfig) -> Iterator[tuple[str, BenchConfig]]:
 
 def figure(value: float) -> str:
     """One digit after the point, two figures of a small number, four of a large one."""
-    return (
-        f"{value:.1f}" if 0.95 <= value < 1000 else f"{value:.2g}" if value < 1 else f"{value:.4g}"
-    )
+    if 0.95 <= value < 1000:
+        return f"{value:.1f}"
+    if value < 1:
+        return f"{value:.2g}"
+    return f"{value:.4g}"
 
 
 def _percent(share: float) -> str:

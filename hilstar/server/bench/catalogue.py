@@ -84,7 +84,10 @@ def bench_catalogue(
     sky = file.config.sky
     choice = catalogue_choice(file.config, file.folder)
     every = choose_catalog(choice)
-    limit = sky.faintest_v_mag if faintest_v_mag is None else faintest_v_mag
+    if faintest_v_mag is None:
+        limit = sky.faintest_v_mag
+    else:
+        limit = faintest_v_mag
     rows = np.flatnonzero(every.v_mag <= limit)
     if not len(rows):
         raise InputError(
@@ -92,7 +95,10 @@ def bench_catalogue(
             " faintest_v_mag"
         )
     rows = rows[np.argsort(every.v_mag[rows], kind="stable")]
-    epoch = sky.epoch_jyear if epoch_jyear is None else epoch_jyear
+    if epoch_jyear is None:
+        epoch = sky.epoch_jyear
+    else:
+        epoch = epoch_jyear
     chosen = every.taken(rows)
     facts = table_facts(choice, chosen, errors_of(chosen))
     light, zero_points = _light(file, chosen, facts)
@@ -112,7 +118,8 @@ def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> dict[s
     correlation = np.divide(
         motion.covariance[:, 0, 1], product, out=np.full(len(product), np.nan), where=product > 0
     )
-    place, speed = "pos.eq.ra;meta.main", "pos.pm;pos.eq.ra"
+    place = "pos.eq.ra;meta.main"
+    speed = "pos.pm;pos.eq.ra"
     return {
         "hip": Column(stars.hip, "", "meta.id;meta.main", "Hipparcos number, 0 for a star without"),
         "name": Column(
@@ -212,9 +219,11 @@ def _decimals(values: npt.NDArray[np.float32]) -> FloatArray:
 def _light(
     file: BenchFile, stars: Catalog, facts: dict[str, Any]
 ) -> tuple[dict[str, Column], dict[str, float]]:
-    sky, optics = file.config.sky, bench_optics(file.config.tracker, file.folder)
+    sky = file.config.sky
+    optics = bench_optics(file.config.tracker, file.folder)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
-    rates, kind = star_rates(file.config, file.folder), star_kinds(file.config, stars)
+    rates = star_rates(file.config, file.folder)
+    kind = star_kinds(file.config, stars)
     rate = rates(stars.v_mag, stars.bv_mag, stars.vi_mag, kind)
     zero_points = {
         "vega": VEGA_V_MAG + magnitude(1 / vega_electrons_per_s(optics, photometry)),
@@ -231,8 +240,12 @@ def _light(
     }
     for band in BANDS:
         values = stars.v_mag + colour[band](stars.bv_mag, stars.vi_mag, kind)
-        words = f"synthetic, its spectrum through {PASSBANDS[band]}{NOT_MEASURED.get(band, '')}"
-        columns[f"{band}_mag"] = Column(values, "mag", f"phot.mag;em.opt.{band.upper()}", words)
+        light_note = (
+            f"synthetic, its spectrum through {PASSBANDS[band]}{NOT_MEASURED.get(band, '')}"
+        )
+        columns[f"{band}_mag"] = Column(
+            values, "mag", f"phot.mag;em.opt.{band.upper()}", light_note
+        )
     columns["b_measured_mag"] = Column(
         stars.v_mag + stars.bv_mag, "mag", "phot.mag;em.opt.B", "V + (B-V), as measured"
     )
@@ -247,9 +260,9 @@ def _light(
         rate, "1/s", "phot.count", "electrons per second in this tracker"
     )
     for system, zero in zero_points.items():
-        words = f"magnitude in this tracker, {zero:.4f} - 2.5 log10(electrons_per_s)"
+        light_note = f"magnitude in this tracker, {zero:.4f} - 2.5 log10(electrons_per_s)"
         columns[f"instrument_mag_{system}"] = Column(
-            zero + magnitude(rate), "mag", "phot.mag;instr", words
+            zero + magnitude(rate), "mag", "phot.mag;instr", light_note
         )
     columns["sigma_instrument_mag"] = Column(
         sigma_instrument_mag(stars, facts, rates, kind),
@@ -268,7 +281,9 @@ def sigma_instrument_mag(
 
     That of the step from colours to a spectrum is not in it.
     """
-    v, bv, vi = stars.v_mag, stars.bv_mag, stars.vi_mag
+    v = stars.v_mag
+    bv = stars.bv_mag
+    vi = stars.vi_mag
     half = COLOUR_STEP_MAG / 2
     by_bv = (
         magnitude(rates(v, bv + half, vi, kind) / rates(v, bv - half, vi, kind)) / COLOUR_STEP_MAG
@@ -284,7 +299,8 @@ def sigma_instrument_mag(
 def _distances(
     stars: Catalog, facts: dict[str, Any], light: dict[str, Column]
 ) -> dict[str, Column]:
-    parallax, sigma = stars.parallax_mas, facts["sigma_parallax_mas"]
+    parallax = stars.parallax_mas
+    sigma = facts["sigma_parallax_mas"]
     sure = (parallax > 0) & ~(parallax < MIN_PARALLAX_SIGMAS * sigma)
     modulus = 10 - 5 * np.log10(np.where(sure, parallax, np.nan))
     return {
@@ -352,25 +368,28 @@ def nearest_neighbours(
 
     vectors = unit_vectors_icrs(every, epoch_jyear)
     tree = cKDTree(vectors)
-    found, chord = rows.copy(), np.full(len(rows), np.nan)
-    left, count = np.arange(len(rows)), 8
-    while len(left):
+    neighbours = rows.copy()
+    chord = np.full(len(rows), np.nan)
+    rest = np.arange(len(rows))
+    count = 8
+    while len(rest):
         count = min(count, len(every))
         far, near = (
             np.atleast_2d(part)
-            for part in tree.query(vectors[rows[left]], k=np.arange(1, count + 1))
+            for part in tree.query(vectors[rows[rest]], k=np.arange(1, count + 1))
         )
-        fits = (every.v_mag[near] < every.v_mag[rows[left], None] + FAINTER_MAG) & (
-            near != rows[left, None]
+        fits = (every.v_mag[near] < every.v_mag[rows[rest], None] + FAINTER_MAG) & (
+            near != rows[rest, None]
         )
         first = fits.argmax(axis=1)
-        has = fits[np.arange(len(left)), first]
-        found[left[has]] = near[has, first[has]]
-        chord[left[has]] = far[has, first[has]]
+        has = fits[np.arange(len(rest)), first]
+        neighbours[rest[has]] = near[has, first[has]]
+        chord[rest[has]] = far[has, first[has]]
         if count == len(every):
             break
-        left, count = left[~has], count * 4
-    return found, 2 * np.arcsin(chord / 2) * ARCSEC_PER_RAD
+        rest = rest[~has]
+        count = count * 4
+    return neighbours, 2 * np.arcsin(chord / 2) * ARCSEC_PER_RAD
 
 
 def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
@@ -379,7 +398,10 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
     """
     from astropy.table import Table
 
-    ending = ".csv" if path == STDOUT else path.suffix.lower()
+    if path == STDOUT:
+        ending = ".csv"
+    else:
+        ending = path.suffix.lower()
     table = Table({name: column.values for name, column in catalogue.columns.items()})
     for name, column in catalogue.columns.items():
         table[name].unit, table[name].description = column.unit or None, column.words

@@ -113,20 +113,22 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
         """The largest |value| + half width of the interval of some quantities; None where it has
         none of them.
         """
-        found = [
-            max(abs(each.lower), abs(each.upper))
-            for each in self.figures
-            if each.quantity in set(quantities)
-        ]
-        return max(found) if found else None
+        half_widths = []
+        for figure in self.figures:
+            if figure.quantity in set(quantities):
+                half_widths.append(max(abs(figure.lower), abs(figure.upper)))
+        return max(half_widths) if half_widths else None
 
     @property
     def attitude_arcsec(self) -> tuple[float, float] | None:
         """How far the bench's own attitude may be off at 95 %, across the boresight and about
         it; None where not assessed.
         """
-        cross, roll = self.expanded(("attitude_x", "attitude_y")), self.expanded(("attitude_z",))
-        return None if cross is None or roll is None else (cross, roll)
+        cross = self.expanded(("attitude_x", "attitude_y"))
+        roll = self.expanded(("attitude_z",))
+        if cross is None or roll is None:
+            return None
+        return (cross, roll)
 
     @property
     def line(self) -> str:
@@ -138,14 +140,14 @@ def read_certificate(path: Path) -> Certificate:
     """A certificate. Raises InputError for a file that is none."""
     raw = read_bytes(path, ADVICE, MAX_BYTES)
     try:
-        found = msgspec.json.decode(raw, type=Certificate)
+        certificate = msgspec.json.decode(raw, type=Certificate)
     except NOT_JSON as error:
         raise InputError(f"{path}: is no certificate ({shortened(error)}); {ADVICE}") from error
-    if found.kind != KIND:
+    if certificate.kind != KIND:
         raise InputError(
-            f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}"
+            f"{path}: kind = {shortened(repr(certificate.kind))} and {KIND!r} is wanted; {ADVICE}"
         )
-    return found
+    return certificate
 
 
 def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Certificate | None:
@@ -157,14 +159,15 @@ def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Ce
     name = file.config.certify.certificate
     if name is None:
         return None
-    found = read_certificate((file.folder / name).resolve())
-    if found.bench_sha256 != file.sha256:
+    certificate = read_certificate((file.folder / name).resolve())
+    if certificate.bench_sha256 != file.sha256:
         say_once(
-            f"{found.line} is of another state of this bench file; {ANEW}", "[certify] certificate"
+            f"{certificate.line} is of another state of this bench file; {ANEW}",
+            "[certify] certificate",
         )
-    if found.valid_until < (today or datetime.datetime.now(datetime.UTC).date()).isoformat():
-        say_once(f"{found.line} is over; {ANEW}", "[certify] certificate")
-    return found
+    if certificate.valid_until < (today or datetime.datetime.now(datetime.UTC).date()).isoformat():
+        say_once(f"{certificate.line} is over; {ANEW}", "[certify] certificate")
+    return certificate
 
 
 def off_by(found: Certificate) -> str:
@@ -180,5 +183,5 @@ def off_by(found: Certificate) -> str:
 
 def certificate_number(file: BenchFile) -> str:
     """The number of a bench's certificate, "" without one. Raises InputError."""
-    found = bench_certificate(file)
-    return "" if found is None else found.number
+    certificate = bench_certificate(file)
+    return "" if certificate is None else certificate.number

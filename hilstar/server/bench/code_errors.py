@@ -178,20 +178,29 @@ def code_stars(
     they are; more are many stars, which have any magnitude between the first and the last.
     """
     shown = peaks[peaks <= 1.0]
-    mags = np.unique(np.maximum(-2.5 * np.log10(shown), 0.0)) if len(shown) else np.zeros(1)
-    begins, ends = mags, mags
+    if len(shown):
+        mags = np.unique(np.maximum(-2.5 * np.log10(shown), 0.0))
+    else:
+        mags = np.zeros(1)
+    begins = mags
+    ends = mags
     if len(mags) > SPANS:
         edges = np.linspace(mags[0], mags[-1], SPANS + 1)
-        begins, ends = edges[:-1], edges[1:]
+        begins = edges[:-1]
+        ends = edges[1:]
     spans = tuple(zip(begins.tolist(), ends.tolist(), strict=True))
-    rgb = b"" if response.rgb is None else response.rgb.tobytes()
+    if response.rgb is None:
+        rgb = b""
+    else:
+        rgb = response.rgb.tobytes()
     tables = response.light.tobytes(), response.threshold.tobytes(), rgb
     return CodeStars(psf, seen, frames, kinds, spans, tables, response)
 
 
 @lru_cache(maxsize=32)
 def _grid(psf: Psf, seen: Seen, path_px: float, number: int) -> PhaseGrid:
-    steps, spread = np.arange(PHASES), spread_phases(PHASES)
+    steps = np.arange(PHASES)
+    spread = spread_phases(PHASES)
     first_x, first_y = GRIDS[number]
     x_px = (steps + first_x) / PHASES - 0.5
     y_px = (steps + first_y) / PHASES - 0.5
@@ -278,7 +287,9 @@ class _Search:
     """The errors of the stars that were looked at so far."""
 
     def __init__(self, stars: CodeStars, method: Quantisation, limit: tuple[float, float]) -> None:
-        self._stars, self._method, self._limit = stars, method, limit
+        self._stars = stars
+        self._method = method
+        self._limit = limit
         self._panel = Panel(stars.response, WHITE)
         self._balance = Balance(stars.psf, stars.seen)
         smooth = method == ROUNDED and not stars.path_px
@@ -306,7 +317,8 @@ class _Search:
 
     def worst(self) -> CodeErrors:
         """The largest errors so far, flux and place each by itself."""
-        flux, place = self._of_flux, self._of_place
+        flux = self._of_flux
+        place = self._of_place
         if flux is None:
             raise AssertionError("a span was looked at")
         by_span = tuple(

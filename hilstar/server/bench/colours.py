@@ -152,19 +152,19 @@ class Colours:
         if stars.colours is not None:
             return np.asarray(stars.colours[which])
         row = stars.row[which]
-        listed, none = row >= 0, np.full(len(which), np.nan)
-        vi = (
-            np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none)
-            if len(stars.catalog)
-            else none
-        )
+        listed = row >= 0
+        none = np.full(len(which), np.nan)
+        if len(stars.catalog):
+            vi = np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none)
+        else:
+            vi = none
         kind = None
         if self._kinds is not None:
             kind = np.where(listed[:, None], self._kinds[np.maximum(row, 0)], np.nan)
         return self._means(stars.bv_mag[which], vi, kind)
 
     def _means(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
-        flux = [one(np.zeros(len(bv_mag)), bv_mag, vi_mag, kind) for one in self._curves]
+        flux = [curve(np.zeros(len(bv_mag)), bv_mag, vi_mag, kind) for curve in self._curves]
         means = np.stack(flux[1:], axis=1) / flux[0][:, None]
         if self.lateral is not None:
             means[:, MOVED:] -= self.lateral.lifted
@@ -184,7 +184,8 @@ class Colours:
         )
         from scipy.optimize import minimize  # 0.2 s of every command that needs none of it
 
-        lens, size_px = self.lateral, float(np.abs(self.lateral.px).max())
+        lens = self.lateral
+        size_px = float(np.abs(self.lateral.px).max())
 
         # the mean square of what is out of reach, and its gradient
         def left(aside: FloatArray) -> tuple[float, FloatArray]:
@@ -197,10 +198,10 @@ class Colours:
             square = np.square(rest / size_px).sum(axis=1).mean() + ASIDE_COST * aside @ aside
             return float(square), 2 * (ASIDE_COST * aside - rest.mean(axis=0) / size_px)
 
-        found = (
+        mixtures = (
             minimize(left, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6}).x * size_px
         )
-        return replace(self, lateral=replace(lens, aside=found))
+        return replace(self, lateral=replace(lens, aside=mixtures))
 
     def shares(self, wanted: FloatArray) -> FloatArray:
         """The light of each primary (n, 3) for what is `wanted`, as shares of a star's
@@ -214,8 +215,8 @@ class Colours:
         if (lens := self.lateral) is not None:
             gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
             near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
-        found = nearest_mixtures(gram, near, whole=True)
-        return np.asarray(found / found.sum(axis=1, keepdims=True))  # to 1e-11
+        mixtures = nearest_mixtures(gram, near, whole=True)
+        return np.asarray(mixtures / mixtures.sum(axis=1, keepdims=True))  # to 1e-11
 
     def on(self, stars: Stars) -> Stars:
         """The stars with the light of each primary."""
@@ -226,7 +227,8 @@ class Colours:
         """The light of each primary of every star, and of light of the colours BV_MAG."""
         if stars.primaries is not None and stars.primaries_by_bv is not None:
             return stars.primaries, stars.primaries_by_bv
-        by_bv, unknown = stars.colours_by_bv, np.full_like(BV_MAG, np.nan)
+        by_bv = stars.colours_by_bv
+        unknown = np.full_like(BV_MAG, np.nan)
         if by_bv is None:
             by_bv = self._means(
                 BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan)
@@ -270,10 +272,10 @@ class Colours:
 
         The colour is blue's electrons over red's, or the mean wavelength.
         """
-        found = [
-            np.interp(warmth(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)
-        ]
-        return np.asarray(found[0] / found[1])
+        temperatures_k = []
+        for primary_shares in (self.shown(shares), wanted):
+            temperatures_k.append(np.interp(warmth(primary_shares), self._scale, SCALE_K))
+        return np.asarray(temperatures_k[0] / temperatures_k[1])
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
         """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where
@@ -290,16 +292,15 @@ class Colours:
         `off_gamut` is the share of electrons in the wrong channel; of one channel the mean
         wavelengths wanted and shown stand for it. Light that is no star's has NaN.
         """
-        own = np.flatnonzero(star >= 0)
-        wanted, shares = self.wanted(stars, star[own]), self.shares_of(stars, star[own])
-        shown, off, rate = (
-            self.shown(shares),
-            self.off(wanted, shares),
-            truth["electrons_per_s"][own],
-        )
+        star_rows = np.flatnonzero(star >= 0)
+        wanted = self.wanted(stars, star[star_rows])
+        shares = self.shares_of(stars, star[star_rows])
+        shown = self.shown(shares)
+        off = self.off(wanted, shares)
+        rate = truth["electrons_per_s"][star_rows]
         added = {
             "temperature_shown_k": (
-                truth["temperature_k"][own] * self.temperature_factor(wanted, shares)
+                truth["temperature_k"][star_rows] * self.temperature_factor(wanted, shares)
             )
         }
         if self.mono:
@@ -308,10 +309,11 @@ class Colours:
         else:
             for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
                 added |= {
-                    f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)
+                    f"{name}_{primary}_per_s": rate * kind[:, k]
+                    for k, primary in enumerate(PRIMARIES)
                 }
             added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
-        return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
+        return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, star_rows)
 
     def driven(self, sprites: FrameLight, stars: Stars) -> FrameLight:
         """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
@@ -324,8 +326,8 @@ class Colours:
             return replace(sprites, primaries=light)
         # the same objects are the same light: it is moved once
         if not self._kept or self._kept[0] != sprites.extended:
-            each = extended_by_share(sprites, stars, primaries, by_bv)
-            moved = zip(each, self.places_px.tolist(), strict=True)
+            by_primary_light = extended_by_share(sprites, stars, primaries, by_bv)
+            moved = zip(by_primary_light, self.places_px.tolist(), strict=True)
             self._kept[:] = [
                 sprites.extended,
                 tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved),
@@ -369,8 +371,8 @@ def mixed_for(
         )
     optics = all_channels(list(channels.values()))
     nm = np.arange(optics.range_nm[0], optics.range_nm[1] + STEP_NM, STEP_NM)
-    seen = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
-    density = np.array([one(nm) for one in primaries]) * seen
+    response_nm = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
+    density = np.array([curve(nm) for curve in primaries]) * response_nm
     density /= density.sum(axis=1, keepdims=True)
     places = np.asarray(places_px)
     if len(channels) > 1:
@@ -392,20 +394,26 @@ def mixed_for(
     above = np.cumsum(up_to[:, ::-1], axis=1)[:, ::-1] * STEP_NM
     knots = nm[::KNOT_STEPS]
     plain = optics.quantum_efficiency
-    edge_nm = plain.wavelength_nm if len(plain.wavelength_nm) else np.array(optics.range_nm)
+    if len(plain.wavelength_nm):
+        edge_nm = plain.wavelength_nm
+    else:
+        edge_nm = np.array(optics.range_nm)
     knots = np.unique(
         np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm])
     )
-    lateral = Lateral.of(psf, nm, density) if isinstance(psf, GlassPsf) else None
-    weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
+    if isinstance(psf, GlassPsf):
+        lateral = Lateral.of(psf, nm, density)
+    else:
+        lateral = None
+    weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, curve) for curve in above)]
     weights += (
         []
         if lateral is None
         else [*(NodeSpline(lateral.nm)(knots) @ lateral.px + lateral.lifted).T]
     )
     curves = tuple(
-        rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one)))
-        for one in weights
+        rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * curve)))
+        for curve in weights
     )
     return Colours(
         matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral
@@ -414,7 +422,7 @@ def mixed_for(
 
 def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
     """The rising index of black bodies of SCALE_K."""
-    found = []
+    scales = []
     for optics in channels.values():
         curves = optics.quantum_efficiency, optics.transmission
         nm, weight = integration_nodes(*curves)
@@ -425,5 +433,5 @@ def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
             * curves[1](nm)
             * weight
         )
-        found.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
-    return np.maximum.accumulate(warmth(np.stack(found, axis=1)))
+        scales.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
+    return np.maximum.accumulate(warmth(np.stack(scales, axis=1)))

@@ -35,7 +35,9 @@ class Drawn:
         """The turn along which the stars' paths were drawn (3,), cam components; None where they
         are points.
         """
-        return None if self.sprites is None else self.sprites.rate_cam_rad_s
+        if self.sprites is None:
+            return None
+        return self.sprites.rate_cam_rad_s
 
     @cached_property
     def levels(self) -> Levels:

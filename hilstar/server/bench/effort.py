@@ -117,7 +117,9 @@ class Light:
     @property
     def judges(self) -> tuple[Centroider, ...]:
         """The centroiders that judge where codes show a star."""
-        return FAMILY if self.centroider is None else (self.centroider,)
+        if self.centroider is None:
+            return FAMILY
+        return (self.centroider,)
 
     @property
     def stars(self) -> float:
@@ -237,7 +239,9 @@ class Effort:
     @property
     def claimed_turn_deg_s(self) -> float:
         """The fastest turn that the errors are claimed of; 0 where no frame turns."""
-        return 0.0 if self.light.turning is None else CLAIMED_TURN_DEG_S
+        if self.light.turning is None:
+            return 0.0
+        return CLAIMED_TURN_DEG_S
 
     @property
     def motion_above_px(self) -> float:
@@ -304,11 +308,10 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     combinations = sorted(_combinations(render, light, methods), key=lambda one: one.ms)
     best = [one for one in combinations if one.method == methods[-1]]
     # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
-    tested = (
-        combinations
-        if len(best) > 1
-        else [one for one in combinations if one.method != methods[-1]]
-    )
+    if len(best) > 1:
+        tested = combinations
+    else:
+        tested = [one for one in combinations if one.method != methods[-1]]
     stars = light.code_stars() if tested else None
     for one in tested:
         if stars is not None and _is_within(render, light, stars, one):
@@ -325,7 +328,8 @@ def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
     """
     if render.quantisation != "auto":
         return (render.quantisation,)
-    table, known = light.tabulated_cost(light.psf), known_cost(render, light)
+    table = light.tabulated_cost(light.psf)
+    known = known_cost(render, light)
     if exact_in_time(table, known, IN_TIME_SHARE * light.refresh_ms):
         return BY_COST
     return BY_COST[:1]
@@ -381,7 +385,8 @@ def _is_slight(render: RenderSettings, one: Combination) -> bool:
     """Whether sprites and paths add next to nothing to the codes' error, or as little as they
     can.
     """
-    sprites, motion = one.sprites.choice, one.motion
+    sprites = one.sprites.choice
+    motion = one.motion
     share = max(sprites.error_mag / render.tolerance_mag, sprites.error_px / render.tolerance_px)
     is_whole = sprites.error_mag <= MAG_PER_SHARE * MAX_CUT
     return (is_whole or share <= SLIGHT) and motion.above_px <= render.motion_above_px
@@ -389,8 +394,11 @@ def _is_slight(render: RenderSettings, one: Combination) -> bool:
 
 def _scale(render: RenderSettings, light: Light) -> float:
     """How long a frame takes where it is drawn, by the table's time."""
-    table, known = light.tabulated_cost(light.psf), known_cost(render, light)
-    return 1.0 if known is None or not table.cheap_ms else known.cheap_ms / table.cheap_ms
+    table = light.tabulated_cost(light.psf)
+    known = known_cost(render, light)
+    if known is None or not table.cheap_ms:
+        return 1.0
+    return known.cheap_ms / table.cheap_ms
 
 
 def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> float:
@@ -399,21 +407,29 @@ def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> floa
     known = known_cost(render, light)
     whole_ms = light.cost(QUANTISERS[method], light.psf).a_star_ms * light.stars * scale
     if known is not None and method in BY_COST:
-        whole_ms = known.cheap_ms if method == CHEAP else known.best_ms
+        if method == CHEAP:
+            whole_ms = known.cheap_ms
+        else:
+            whole_ms = known.best_ms
     others_ms = scale * light.stars * (PIXEL_MS * light.psf.footprint_px**2 + PATH_MS)
     return max(whole_ms - others_ms, 0.0)
 
 
 def code_part(effort: Effort) -> Choice:
     """The choice of the codes."""
-    render, light, method = effort.asked, effort.light, effort.quantisation
+    render = effort.asked
+    light = effort.light
+    method = effort.quantisation
     errors = effort.codes
     cost = known_cost(render, light) or light.tabulated_cost(light.psf)
     ms = codes_ms(render, light, method)
     saved_ms = max(codes_ms(render, light, BEST) - ms, 0.0)
     notes = []
     if errors.centroider is not None:
-        whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
+        if len(light.judges) == 1:
+            whom = ""
+        else:
+            whom = f", the worst of {len(light.judges)} centroiders"
         notes.append(f"as `{errors.centroider}` finds stars{whom}")
     if errors.turns:
         notes.append(f"turning at {CLAIMED_TURN_DEG_S:g} deg/s")
@@ -427,14 +443,16 @@ def code_part(effort: Effort) -> Choice:
 def _price(cost: FieldCost, light: Light) -> str:
     """What `exact` takes of a refresh."""
     best_ms, cheap_ms = (_two_digits(ms) for ms in (cost.best_ms, cost.cheap_ms))
-    words = f"exact takes {best_ms} ms of {light.refresh_ms:.3g} (round {cheap_ms})"
-    words += f" for an average field at 1 deg/s {cost.where}"
-    return f"{words}, {cost.why}" if cost.why else words
+    price_text = f"exact takes {best_ms} ms of {light.refresh_ms:.3g} (round {cheap_ms})"
+    price_text += f" for an average field at 1 deg/s {cost.where}"
+    return f"{price_text}, {cost.why}" if cost.why else price_text
 
 
 def _two_digits(number: float) -> str:
     """A number to two digits, and whole from 100 on."""
-    return f"{number:.2g}" if number < 99.5 else f"{number:.0f}"
+    if number < 99.5:
+        return f"{number:.2g}"
+    return f"{number:.0f}"
 
 
 def side_candidates(render: RenderSettings, light: Light, method: Quantisation) -> list[Sides]:
@@ -443,7 +461,7 @@ def side_candidates(render: RenderSettings, light: Light, method: Quantisation) 
     full = psf.footprint_px
     sizes = list(range(full % 2 or 2, full, 2))
     pixels_ms = PIXEL_MS * light.stars * _scale(render, light)
-    found = []
+    candidates = []
     if render.effort == "auto" and not psf.by_place:
         for size in sizes:
             sides = _sides(light, method, sizes, size)
@@ -458,17 +476,23 @@ def side_candidates(render: RenderSettings, light: Light, method: Quantisation) 
                 pixels_ms * mean_px,
                 saved_ms,
             )
-            found.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
-    sides = (
-        _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
-    )
+            candidates.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
+    if render.effort == "auto" and not psf.by_place:
+        sides = _sides(light, method, sizes, full)
+    else:
+        sides = ()
     mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
     smallest = min((side.side_px for side in sides), default=full)
-    chosen = f"{smallest} to {full} px a side" if smallest < full else f"{full} px a side"
+    if smallest < full:
+        chosen = f"{smallest} to {full} px a side"
+    else:
+        chosen = f"{full} px a side"
     saved_ms = pixels_ms * (full**2 - mean_px)
     cut = MAG_PER_SHARE * MAX_CUT
-    found.append(Sides(sides, Choice("sprites", chosen, cut, 0.0, pixels_ms * mean_px, saved_ms)))
-    return found
+    candidates.append(
+        Sides(sides, Choice("sprites", chosen, cut, 0.0, pixels_ms * mean_px, saved_ms))
+    )
+    return candidates
 
 
 def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -> SpriteSides:
@@ -496,7 +520,9 @@ def _mean_area_px(sides: SpriteSides, rates_e_per_s: FloatArray, full: int) -> f
     area = np.full(len(rates_e_per_s), full**2)
     for side in sides:
         area[rates_e_per_s < side.below_e_per_s] = side.side_px**2
-    return float(area.mean()) if len(area) else float(full**2)
+    if len(area):
+        return float(area.mean())
+    return float(full**2)
 
 
 def cut_mag(size_px: int, psf: Psf) -> float:
@@ -508,7 +534,8 @@ def cut_px(size_px: int, psf: Psf) -> float:
     """How far a square sprite's edge shifts the centroid at the worst phase, px, both axes
     combined.
     """
-    worst, offsets = np.zeros(2), np.arange(size_px) - (size_px - 1) // 2
+    worst = np.zeros(2)
+    offsets = np.arange(size_px) - (size_px - 1) // 2
     for fraction in np.linspace(0.0, 1.0, CUT_PHASES) - (0.5 if size_px % 2 else 0.0):
         at = offsets - fraction
         shares = psf.shares(at[None, :], at[:, None])
@@ -530,12 +557,16 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
             for share in MOTION_SHARES
             if share * render.tolerance_px > floor_px
         ]
-    found = []
+    candidates = []
     for px in above_px:
-        ms, saved_ms, note = path_ms, 0.0, CLAIMED
+        ms = path_ms
+        saved_ms = 0.0
+        note = CLAIMED
         if px > floor_px:
             # Only frames between the file's motion and this one are drawn sooner.
-            ms, saved_ms, note = 0.0, path_ms, f"{CLAIMED}; saves in frames that move less"
+            ms = 0.0
+            saved_ms = path_ms
+            note = f"{CLAIMED}; saves in frames that move less"
         choice = Choice(
             "paths",
             f"from {px:g} px within a frame on",
@@ -545,8 +576,8 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
             saved_ms,
             note,
         )
-        found.append(Motion(px, choice))
-    return found
+        candidates.append(Motion(px, choice))
+    return candidates
 
 
 def psf_part(light: Light, choice: Choice) -> Choice:

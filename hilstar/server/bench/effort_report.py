@@ -54,13 +54,17 @@ def _errors(effort: Effort, choice: Choice) -> tuple[str, str]:
 
 
 def _saved(choice: Choice) -> str:
-    return f"{choice.saved_ms:.2f} ms" if choice.saved_ms else "-"
+    if choice.saved_ms:
+        return f"{choice.saved_ms:.2f} ms"
+    return "-"
 
 
 def _remedy_head(remedy: Remedy) -> str:
     if not remedy.within:
         return "would not do alone"
-    return "would do together" if len(remedy.changes) > 1 else "would do"
+    if len(remedy.changes) > 1:
+        return "would do together"
+    return "would do"
 
 
 def _remedy_text(remedy: Remedy) -> str:

@@ -71,13 +71,16 @@ def _fault_camera(
     def apparent(vectors: FloatArray) -> FloatArray:
         if moving is not None:
             return moving.stars_seen(vectors, np.zeros(len(vectors)))
-        return aberrate(vectors, velocity_km_s) if any(velocity_km_s) else vectors
+        if any(velocity_km_s):
+            return aberrate(vectors, velocity_km_s)
+        return vectors
 
     @lru_cache(maxsize=256)
     def v0_e_per_s(bv_mag: float) -> float:
         return float(tables()(np.zeros(1), np.array([bv_mag]), np.array([np.nan]))[0])
 
-    points, exposure_s = StarLayer(canvas), file.config.tracker.exposure_s
+    points = StarLayer(canvas)
+    exposure_s = file.config.tracker.exposure_s
     return FaultCamera(canvas, monitor, tracker, exposure_s, points, apparent, v0_e_per_s, stars)
 
 

@@ -164,11 +164,9 @@ class Bench:
         """How much of white each of `stars` asks for by its colour, relative to a white star as
         bright; 1 for all in grey.
         """
-        return (
-            1.0
-            if self.colours is None
-            else self.colours.drive(self.colours.shares_of(self.stars, np.arange(len(self.stars))))
-        )
+        if self.colours is None:
+            return 1.0
+        return self.colours.drive(self.colours.shares_of(self.stars, np.arange(len(self.stars))))
 
     @property
     def quantiser(self) -> type[Quantiser]:
@@ -217,7 +215,10 @@ class Bench:
         A rate that moves no star by more than `[render] motion_above_px` is 0 in it, and the
         attitude that at the middle of the middle row's light.
         """
-        rate = None if rate_cam_rad_s is None else np.asarray(rate_cam_rad_s, dtype=np.float64)
+        if rate_cam_rad_s is None:
+            rate = None
+        else:
+            rate = np.asarray(rate_cam_rad_s, dtype=np.float64)
         if rate is not None:
             motion_px = float(np.linalg.norm(rate)) * self.scan.longest_s * self._px_per_rad
             if 0 < motion_px <= self.config.render.motion_above_px:
@@ -246,11 +247,9 @@ class Bench:
         )
 
     def _coloured(self, sprites: FrameLight, stars: Stars) -> FrameLight:
-        return (
-            sprites
-            if self.spectra is None
-            else replace(sprites, spectra=self.spectra(stars, sprites.star))
-        )
+        if self.spectra is None:
+            return sprites
+        return replace(sprites, spectra=self.spectra(stars, sprites.star))
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> FrameLight:
         """The sprites of `stars` (by default those bright enough to show) as points, at an
@@ -277,11 +276,10 @@ class Bench:
         Bodies are where they are at `t_ns`, by default at the start; without a rate satellites'
         paths have their middle there.
         """
-        light = (
-            None
-            if q_icrs_to_cam is None
-            else self.light(self.view(q_icrs_to_cam, rate_cam_rad_s, t_ns))
-        )
+        if q_icrs_to_cam is None:
+            light = None
+        else:
+            light = self.light(self.view(q_icrs_to_cam, rate_cam_rad_s, t_ns))
         return self.draw_sprites(light, frame)
 
     def discs(self, view: View) -> list[Disc]:
@@ -302,7 +300,10 @@ class Bench:
         """Draw the levels of a frame's sprites."""
         sprites = self._driven(sprites, self.shown_stars)
         self.renderer.draw(sprites, frame)
-        clipped = None if sprites is None else self._clipped(sprites)
+        if sprites is None:
+            clipped = None
+        else:
+            clipped = self._clipped(sprites)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
         return Drawn(
@@ -315,15 +316,15 @@ class Bench:
         """Sprites with the light of each primary, where those are driven apart; `sprites.star`
         has places among `stars`.
         """
-        return (
-            sprites
-            if sprites is None or self.colours is None
-            else self.colours.driven(sprites, stars)
-        )
+        if sprites is None or self.colours is None:
+            return sprites
+        return self.colours.driven(sprites, stars)
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""
-        return len(self.sprites(q_icrs_to_cam, self.faint_stars)) if len(self.faint_stars) else 0
+        if len(self.faint_stars):
+            return len(self.sprites(q_icrs_to_cam, self.faint_stars))
+        return 0
 
     def warm_up(self) -> None:
         """Draw once with paths, with stars and with none: a driver compiles its shaders at first
@@ -368,17 +369,21 @@ class Bench:
         )
         drawn &= self.colours is None
         light = linear_light(self.renderer, sprites, self.stars, drawn)
-        driven = sprites if self.colours is None else self.colours.driven(sprites, self.stars)
+        if self.colours is None:
+            driven = sprites
+        else:
+            driven = self.colours.driven(sprites, self.stars)
         truth, star = sprite_truth(self.stars, sprites, self._clipped(driven))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
-            found = disc_stars(self.stars, (disc.name for disc in discs))
+            disc_rows = disc_stars(self.stars, (disc.name for disc in discs))
             middles = (
                 np.array([disc.direction for disc in discs]) @ view.icrs_to_image(self.camera).T
             )
-            rows = truth_table(self.stars, found, *self.camera.project(middles))
+            rows = truth_table(self.stars, disc_rows, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
-            truth, star = np.append(truth, rows), np.append(star, found)
+            truth = np.append(truth, rows)
+            star = np.append(star, disc_rows)
         drive: FloatArray | float = 1.0
         if self.colours is not None:
             truth = self.colours.on_truth(truth, self.stars, star)
@@ -415,16 +420,17 @@ class Bench:
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
         names = sprite_names(self.shown_stars, sprites)
         losses = dict(zip(names, loss_mag.tolist(), strict=True))
-        wanted, shown = frame.linear, shown_light(frame.levels, self.panel)
+        wanted = frame.linear
+        shown = shown_light(frame.levels, self.panel)
         for disc in self.discs(view) if sprites.over_white else ():
             # Of a disc brighter than white, in the pixels of which it has most of the light
             if disc.name in sprites.over_white and self._bodies is not None:
                 alone = self._bodies.alone(disc, view)
                 self.renderer.draw_linear(replace(without_stars(sprites), extended=alone))
-                own = self.renderer.linear() > MOST * wanted
-                if own.any():
+                is_lit = self.renderer.linear() > MOST * wanted
+                if is_lit.any():
                     losses[disc.name] = float(
-                        magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64))
+                        magnitude(shown[is_lit].sum() / wanted[is_lit].sum(dtype=np.float64))
                     )
         return {name: losses[name] for name in clipped if name in losses}
 
@@ -439,18 +445,18 @@ class Bench:
 
     def _clipped(self, sprites: FrameLight) -> IntArray:
         """Places of the sprites that are over white: of light as a whole, or of any primary."""
-        psf, spectra = self.psf, sprites.spectra
+        psf = self.psf
+        spectra = sprites.spectra
         # as bright as the mean PSF's stars with the same peaks
         if psf.by_colour and spectra is not None:
-            data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
+            data = sprites.data.copy()
+            half_white = 0.5 * self.flux_at_white_e_per_s * self.darkest
             bright = np.flatnonzero(
                 data["electrons_per_s"] * (sprites.per_star * psf.peak_share) > half_white
             )
-            x_px, y_px, rate = (
-                sprites.x_px[bright],
-                sprites.y_px[bright],
-                data["electrons_per_s"][bright],
-            )
+            x_px = sprites.x_px[bright]
+            y_px = sprites.y_px[bright]
+            rate = data["electrons_per_s"][bright]
             stamps = psf.stamps_at(
                 x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate
             )
@@ -461,16 +467,20 @@ class Bench:
         screen = self.camera.resolution_px, self.uniformity, self.darkest
         if sprites.primaries is None:
             return clipped_sprites(sprites, psf, self.flux_at_white_e_per_s, *screen)
-        over, places_px = [np.empty(0, dtype=np.intp)], self.renderer.target.places_px
+        over = [np.empty(0, dtype=np.intp)]
+        places_px = self.renderer.target.places_px
         most_e_per_s = sprites.primaries.max(axis=0, initial=0.0) * (
             sprites.per_star * psf.peak_share
         )
-        for k, one in enumerate(self.panel.primaries):
+        for k, primary in enumerate(self.panel.primaries):
             # as in `clipped_sprites`
-            if most_e_per_s[k] > 0.5 * one.flux_at_white_e_per_s * self.darkest:
+            if most_e_per_s[k] > 0.5 * primary.flux_at_white_e_per_s * self.darkest:
                 over.append(
                     clipped_sprites(
-                        by_primary(sprites, places_px, k), psf, one.flux_at_white_e_per_s, *screen
+                        by_primary(sprites, places_px, k),
+                        psf,
+                        primary.flux_at_white_e_per_s,
+                        *screen,
                     )
                 )
         return np.unique(np.concatenate(over))
@@ -516,31 +526,43 @@ def named(found: list[int | str], count: int) -> str:
     """ "Moon, HIP 32349, 27989 and 3 more", or "none"."""
     if not found:
         return "none"
-    bodies, hips = ([one for one in found if isinstance(one, kind)] for kind in (str, int))
+    bodies, hips = (
+        [designation for designation in found if isinstance(designation, kind)]
+        for kind in (str, int)
+    )
     shown = [*bodies, *hips][:count]
-    more = "" if len(found) <= count else f" and {len(found) - count} more"
+    if len(found) <= count:
+        more = ""
+    else:
+        more = f" and {len(found) - count} more"
     first_hip = len(bodies)
     return (
-        ", ".join(f"HIP {one}" if k == first_hip else str(one) for k, one in enumerate(shown))
+        ", ".join(
+            f"HIP {designation}" if k == first_hip else str(designation)
+            for k, designation in enumerate(shown)
+        )
         + more
     )
 
 
 def clipping_line(bench: Bench) -> str | None:
     """One line that names the stars that clip, for the start of a run; None if none does."""
-    found, render = clipping_hip(bench), bench.config.render
-    if not found:
+    clipped = clipping_hip(bench)
+    render = bench.config.render
+    if not clipped:
         return None
     bodies = bool(bench.stars.bodies)
-    one, many = ("star or body", "stars and bodies") if bodies else ("star", "stars")
-    stars = f"1 {one} of the sky is" if len(found) == 1 else f"{len(found)} {many} of the sky are"
-    key = (
-        "flux_at_white_e_per_s"
-        if render.brightest_v_mag is None
-        else f"brightest_v_mag = {render.brightest_v_mag:g}"
-    )
+    singular, many = ("star or body", "stars and bodies") if bodies else ("star", "stars")
+    if len(clipped) == 1:
+        stars = f"1 {singular} of the sky is"
+    else:
+        stars = f"{len(clipped)} {many} of the sky are"
+    if render.brightest_v_mag is None:
+        key = "flux_at_white_e_per_s"
+    else:
+        key = f"brightest_v_mag = {render.brightest_v_mag:g}"
     return (
-        f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render]"
+        f"{stars} brighter than white and clip in view: {named(clipped, NAMED_STARS)} ([render]"
         f" {key})"
     )
 
@@ -549,7 +571,9 @@ def drawn_line(bench: Bench) -> str | None:
     """One line on the PSF by which stars are drawn, where the display brings the tracker's;
     otherwise None.
     """
-    return None if bench.drawn is None else f"[render] {bench.drawn.line()}"
+    if bench.drawn is None:
+        return None
+    return f"[render] {bench.drawn.line()}"
 
 
 def shares_line(bench: Bench) -> str | None:

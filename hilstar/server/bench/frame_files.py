@@ -104,10 +104,8 @@ def _tangent_plane(
     camera: Camera, q_icrs_to_cam: FloatArray, origin_px: tuple[float, float], linear: FloatArray
 ) -> Keywords:
     right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    ra, dec = (
-        np.arctan2(normal[1], normal[0]),
-        np.arctan2(normal[2], np.hypot(normal[0], normal[1])),
-    )
+    ra = np.arctan2(normal[1], normal[0])
+    dec = np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     deg_per_px = np.degrees(1.0 / camera.focal_length_px)
@@ -140,27 +138,31 @@ def fit_sip(camera: Camera) -> Sip | None:
     x_px, y_px = camera.places_px(np.zeros(1), np.zeros(1))
     origin_px = float(x_px[0]), float(y_px[0])
     fitted, held_out = (_pairs(camera, origin_px, count) for count in (FITTED, HELD_OUT))
-    found = []  # the polynomials from pixels to the ideal image
+    polynomials = []  # the polynomials from pixels to the ideal image
     for degree in range(2, MAX_DEGREE + 1):
         whole = _solved(*fitted, degree)
         error_px = float(np.hypot(*(_terms(held_out[0], degree, 1) @ whole - held_out[1]).T).max())
-        found.append((error_px, degree, whole))
+        polynomials.append((error_px, degree, whole))
         if error_px <= GOOD_PX:
             break
-    _, degree, whole = found[-1] if error_px <= GOOD_PX else min(found, key=lambda one: one[0])
+    _, degree, whole = (
+        polynomials[-1] if error_px <= GOOD_PX else min(polynomials, key=lambda one: one[0])
+    )
     p, q = _powers(degree, 1)
     linear = np.concatenate([whole[(p == 1) & (q == 0)], whole[(p == 0) & (q == 1)]]).T
     of_pixels = np.linalg.inv(linear).T  # rows of ideal places to pixels
     forward = whole[p + q >= 2] @ of_pixels
-    pixel, flat = fitted[0], fitted[1] @ of_pixels
+    pixel = fitted[0]
+    flat = fitted[1] @ of_pixels
     back = _solved(flat, pixel - flat, degree)
-    pixel, flat = held_out[0], held_out[1] @ of_pixels
+    pixel = held_out[0]
+    flat = held_out[1] @ of_pixels
     there = pixel + _terms(pixel, degree, 2) @ forward - flat
     again = flat + _terms(flat, degree, 1) @ back - pixel
     error_px = max(float(np.hypot(*off.T).max()) for off in (there, again))
-    return (
-        Sip(degree, origin_px, linear, forward, back, error_px) if error_px <= MAX_SIP_PX else None
-    )
+    if error_px <= MAX_SIP_PX:
+        return Sip(degree, origin_px, linear, forward, back, error_px)
+    return None
 
 
 def _pairs(
@@ -171,9 +173,9 @@ def _pairs(
     """
     x, y = camera.grid_px(count)
     u, v = camera.tangents(x, y)
-    seen = np.isfinite(u)
-    pixel = np.column_stack([x - origin_px[0], y - origin_px[1]])[seen]
-    return pixel, camera.focal_length_px * np.column_stack([u, v])[seen]
+    is_visible = np.isfinite(u)
+    pixel = np.column_stack([x - origin_px[0], y - origin_px[1]])[is_visible]
+    return pixel, camera.focal_length_px * np.column_stack([u, v])[is_visible]
 
 
 def _solved(at: FloatArray, wanted: FloatArray, degree: int) -> FloatArray:
@@ -188,8 +190,8 @@ def _solved(at: FloatArray, wanted: FloatArray, degree: int) -> FloatArray:
 def _powers(degree: int, first: int) -> tuple[IntArray, IntArray]:
     """The powers p and q of all terms of total degree `first` to `degree`."""
     p, q = np.indices((degree + 1, degree + 1)).reshape(2, -1)
-    kept = (p + q >= first) & (p + q <= degree)
-    return p[kept], q[kept]
+    is_wanted = (p + q >= first) & (p + q <= degree)
+    return p[is_wanted], q[is_wanted]
 
 
 def _terms(at: FloatArray, degree: int, first: int) -> FloatArray:
@@ -282,11 +284,10 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
 
     Codes of three channels (height, width, 3) become an RGB picture.
     """
-    image = (
-        np.asarray(codes, dtype=np.uint8)
-        if bits <= 8
-        else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
-    )
+    if bits <= 8:
+        image = np.asarray(codes, dtype=np.uint8)
+    else:
+        image = np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
     written(path, lambda file: file.write(png_of(image)))
 
 
@@ -344,7 +345,8 @@ def _discs(signal: Float32Array) -> Float32Array:
 
     Only lit pixels are looked at, of which a frame of stars has few.
     """
-    edge, reach = PREVIEW_RADIUS_PX, range(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
+    edge = PREVIEW_RADIUS_PX
+    reach = range(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
     picture = np.zeros_like(signal, shape=(signal.shape[0] + 2 * edge, signal.shape[1] + 2 * edge))
     body = _bodies(signal)
     picture[edge:-edge, edge:-edge] = np.where(body, signal, 0)
@@ -354,8 +356,10 @@ def _discs(signal: Float32Array) -> Float32Array:
         for right in reach:
             radius = max(1, math.ceil(math.hypot(down, right)))
             if radius <= PREVIEW_RADIUS_PX:
-                seen = value >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
+                is_inside = value >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
                 np.maximum.at(
-                    picture, (row[seen] + edge + down, column[seen] + edge + right), value[seen]
+                    picture,
+                    (row[is_inside] + edge + down, column[is_inside] + edge + right),
+                    value[is_inside],
                 )
     return picture[edge:-edge, edge:-edge]

@@ -36,8 +36,8 @@ def glass_in(tracker: Tracker, folder: Path) -> Glass | None:
     """
     if tracker.optics.psf == GAUSSIAN:
         return None
-    found = read_glass(folder / tracker.optics.psf)
-    return found if isinstance(found, Glass) else None
+    glass = read_glass(folder / tracker.optics.psf)
+    return glass if isinstance(glass, Glass) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,26 +100,24 @@ def _glass_psf(
     if onto is not None:
         basis, per_px = regridded(glass.basis.astype(np.float64), glass.per_px, onto.matrix)
         weights = glass.weights / (glass.weights @ basis.sum(axis=(1, 2)))[..., None]
-        places_px, lateral_px = (
-            np.round(onto.places_px(glass.places_px), 6),
-            glass.lateral_px @ onto.matrix.T,
-        )
-        each = {"places_px": places_px, "weights": weights, "lateral_px": lateral_px}
-        each |= {"illumination": glass.illumination, "outside": glass.outside}
+        places_px = np.round(onto.places_px(glass.places_px), 6)
+        lateral_px = glass.lateral_px @ onto.matrix.T
+        glass_fields = {"places_px": places_px, "weights": weights, "lateral_px": lateral_px}
+        glass_fields |= {"illumination": glass.illumination, "outside": glass.outside}
         # points far beyond the detector may lie beyond either lens
         known = np.isfinite(places_px).all(axis=1)
         if not known.any():
             raise InputError("none of its points lies before the display's lens")
-        fine = {name: values[known] for name, values in each.items()}
+        fine = {name: values[known] for name, values in glass_fields.items()}
         return glass_psf(
             replace(glass, basis=basis.astype(np.float32), per_px=per_px, **fine),
             focus_um,
             np.array(shares),
         )
-    found = glass_psf(glass, focus_um, np.array(shares))
+    whole_psf = glass_psf(glass, focus_um, np.array(shares))
     width, height = resolution_px
     corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])
-    beyond_px = float(found.field.within(*corners.T)[1].max())
+    beyond_px = float(whole_psf.field.within(*corners.T)[1].max())
     if len(glass.places_px) > 1 and beyond_px > SAID_PX:
         say_once(
             f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest"
@@ -131,7 +129,7 @@ def _glass_psf(
             f"focus_um = {focus_um:g} is beyond the file's {first:g} to {last:g}; the nearest is"
             " taken"
         )
-    return found
+    return whole_psf
 
 
 @lru_cache(maxsize=32)

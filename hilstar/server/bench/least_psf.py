@@ -83,7 +83,10 @@ def psf_choices(
             other = make()
         except InputError:  # negative lobes or noise, which only the whole sum makes up for
             continue
-        errors = PsfErrors(0.0, 0.0) if other is psf else psf_errors(psf, other, places_px)
+        if other is psf:
+            errors = PsfErrors(0.0, 0.0)
+        else:
+            errors = psf_errors(psf, other, places_px)
         note = "; ".join(before) or "more would gain no more than that"
         yield other, Choice("PSF", name, errors.mag, errors.px, note=note)
         before.append(f"{name} would be {errors.line()} off")
@@ -96,10 +99,10 @@ def least_psf(
     among: frozenset[str] | None = None,
 ) -> tuple[Psf, Choice]:
     """The first of `psf_choices` within a tolerance, mag and px; the last where none is."""
-    found, choice = first_within(psf_choices(psf, places_px, among), tolerance)
+    least, choice = first_within(psf_choices(psf, places_px, among), tolerance)
     if choice is None:
         raise AssertionError("each of them has its errors")
-    return found, choice
+    return least, choice
 
 
 def first_within(
@@ -123,10 +126,10 @@ def psf_errors(psf: SampledPsf, other: Psf, places_px: FloatArray) -> PsfErrors:
     """The largest errors of stars at places (n, 2) that are drawn by another PSF."""
     # where a field's corner has no light, nothing but the whole will do
     with np.errstate(divide="ignore", invalid="ignore"):
-        wanted, found = (_measured(one, psf, places_px) for one in (psf, other))
-        mag = MAG_PER_SHARE * float(np.abs(found[..., 0] / wanted[..., 0] - 1).max())
+        wanted, measured = (_measured(candidate, psf, places_px) for candidate in (psf, other))
+        mag = MAG_PER_SHARE * float(np.abs(measured[..., 0] / wanted[..., 0] - 1).max())
     return PsfErrors(
-        mag, float(np.hypot(*np.moveaxis(found[..., 1:] - wanted[..., 1:], 2, 0)).max())
+        mag, float(np.hypot(*np.moveaxis(measured[..., 1:] - wanted[..., 1:], 2, 0)).max())
     )
 
 
@@ -139,24 +142,27 @@ def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
     if one.by_colour:
         stamps = one.stamps_at(x, y, np.tile(_spectra(one), (len(places_px), 1)))
         whole = stamps.shape[1]
-        cut, more = max(0, (whole - side) // 2), max(0, (side - whole) // 2)
+        cut = max(0, (whole - side) // 2)
+        more = max(0, (side - whole) // 2)
         stamps = np.pad(
             stamps[:, cut : cut + side, cut : cut + side], ((0, 0), (more, more), (more, more))
         )
     else:
         stamps = np.moveaxis(one.stamps(fraction, np.ones(len(x)), side), 2, 0)
-    light, pixel = stamps.astype(np.float64), np.arange(side) - side // 2
-    across, down = pixel - fraction[0][:, None], pixel - fraction[1][:, None]
+    light = stamps.astype(np.float64)
+    pixel = np.arange(side) - side // 2
+    across = pixel - fraction[0][:, None]
+    down = pixel - fraction[1][:, None]
     far = (
         across[:, None, :] ** 2 / psf.variance_px2[0] + down[:, :, None] ** 2 / psf.variance_px2[1]
     )
-    found = []
+    moments = []
     for window in (np.ones_like(far), np.exp(-far / 2)):
         inside = light * window
         flux = inside.sum(axis=(1, 2))
         sums = [(inside.sum(axis=axis) * at).sum(axis=1) for axis, at in ((1, across), (2, down))]
-        found.append(np.stack([flux, *(part / flux for part in sums)], axis=1))
-    return np.array(found)
+        moments.append(np.stack([flux, *(part / flux for part in sums)], axis=1))
+    return np.array(moments)
 
 
 def _spectra(psf: Psf) -> FloatArray:

@@ -37,10 +37,13 @@ class MeasuredOn:
         """What it does not say; "" where it says both."""
         if self.built_in:
             return f'[monitor] calibration = "{self.name}" is built in'
-        lacking = [
-            what for what, said in (("monitor", self.identity), ("date", self.date)) if said is None
-        ]
-        return f"{self.name} names no {' and no '.join(lacking)}" if lacking else ""
+        lacking = []
+        for what, stated in (("monitor", self.identity), ("date", self.date)):
+            if stated is None:
+                lacking.append(what)
+        if lacking:
+            return f"{self.name} names no {' and no '.join(lacking)}"
+        return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,8 @@ def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
         identity = msgspec.convert(certificate.monitor["identity"], MonitorIdentity)
         yield MeasuredOn(f"certificate {certificate.number}", identity, _date(certificate.made))
         return
-    calibration, geometry = file.config.monitor.calibration, file.config.collimator.geometry
+    calibration = file.config.monitor.calibration
+    geometry = file.config.collimator.geometry
     if calibration in BUILT_IN:
         yield MeasuredOn(calibration, built_in=True)
     else:
@@ -101,16 +105,18 @@ def check_monitor(
     """
     days = file.config.monitor.calibration_valid_days
     origins = list(measured_on(file))
-    faults, unknown, doubts = [], [one.lacks for one in origins if one.lacks], []
+    faults = []
+    unknown = [one.lacks for one in origins if one.lacks]
+    doubts = []
     for one in origins:
         if one.identity is not None and now is not None:
             doubts = [now.doubt]
             if one.identity.brightness is not None and now.brightness is None:
                 doubts.append("the monitor's own settings cannot be read now (DDC/CI)")
-            if found := ", ".join(differences(one.identity, now)):
+            if changes := ", ".join(differences(one.identity, now)):
                 faults.append(
                     f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}:"
-                    f" {found}"
+                    f" {changes}"
                 )
         if one.date is not None and (age := (today - one.date).days) > days:
             faults.append(
@@ -119,11 +125,12 @@ def check_monitor(
             )
     if now is None:
         unknown = ["this display does not say which monitor it is"]
-    notice = (
-        [f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known"]
-        if unknown
-        else []
-    )
+    if unknown:
+        notice = [
+            f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known"
+        ]
+    else:
+        notice = []
     return MonitorCheck(now, "; ".join(faults), "; ".join(filter(None, (*notice, *doubts))))
 
 

@@ -26,7 +26,9 @@ def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
 
 def calibration_source(monitor: Monitor, folder: Path) -> str | Path:
     """What `[monitor] calibration` names: a built-in curve, or the path of a file."""
-    return monitor.calibration if monitor.calibration in BUILT_IN else folder / monitor.calibration
+    if monitor.calibration in BUILT_IN:
+        return monitor.calibration
+    return folder / monitor.calibration
 
 
 def bench_primaries(monitor: Monitor, folder: Path) -> tuple[Curve, ...] | None:
@@ -34,8 +36,14 @@ def bench_primaries(monitor: Monitor, folder: Path) -> tuple[Curve, ...] | None:
     primaries = monitor.primaries
     if primaries.file is not None:
         return read_primaries(folder / primaries.file)
-    given = [one for one in (primaries.xy_r, primaries.xy_g, primaries.xy_b) if one is not None]
-    return chromatic_primaries(given, primaries.width_nm) if given else None
+    given = [
+        chromaticity
+        for chromaticity in (primaries.xy_r, primaries.xy_g, primaries.xy_b)
+        if chromaticity is not None
+    ]
+    if given:
+        return chromatic_primaries(given, primaries.width_nm)
+    return None
 
 
 def orientation_of(monitor: Monitor) -> Orientation:

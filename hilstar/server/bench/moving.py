@@ -142,14 +142,25 @@ def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = Non
     """One line for each body whose disc is wider than POINT_PX of a camera's pixels, the widest
     first.
     """
-    found = {} if moving is None else moving.diameters_arcsec(t_ns)
+    if moving is None:
+        diameters_arcsec = {}
+    else:
+        diameters_arcsec = moving.diameters_arcsec(t_ns)
     px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
-    widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)
+    widths = sorted(
+        ((d * px_per_arcsec, name, d) for name, d in diameters_arcsec.items()), reverse=True
+    )
     lines = []
     for px, name, arcsec in widths:
         if px > POINT_PX:
-            angle = f"{arcsec:.1f} arcsec" if arcsec < MAX_ARCSEC else f"{arcsec / 3600:.1f} deg"
-            pixels = f"{px:.2f} px" if px < MANY_PX else f"more than {MANY_PX:.0f} px"
+            if arcsec < MAX_ARCSEC:
+                angle = f"{arcsec:.1f} arcsec"
+            else:
+                angle = f"{arcsec / 3600:.1f} deg"
+            if px < MANY_PX:
+                pixels = f"{px:.2f} px"
+            else:
+                pixels = f"more than {MANY_PX:.0f} px"
             lines.append(f"{name}: {angle} wide, {pixels} of the screen; drawn as a disc")
     return lines
 
@@ -158,7 +169,9 @@ def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
     """One line about a bench's satellites at a moment; none without satellites."""
     if sky is None or sky.satellites is None:
         return []
-    placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)
+    placed = sky.satellites_placed(t_ns)
+    known = sky.satellites.listed
+    every = len(sky.satellites)
     return [
         f"satellites: {placed} of {every} have a place by their elements; {known} are in"
         " [sky.bodies] satellite_magnitudes"

@@ -32,19 +32,20 @@ def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colour
     """
     if not drives_apart(config):
         return None
-    primaries, monitor = bench_primaries(config.monitor, folder), config.monitor
+    primaries = bench_primaries(config.monitor, folder)
+    monitor = config.monitor
     if primaries is None:
         raise InputError(
             '[tracker.detector] bayer, and [render] colour = "star" with it, need the light of the'
             ' primaries; write [monitor.primaries] file, or xy_r to xy_b; or colour = "white"'
         )
     places_px = [orientation_of(monitor).in_image(*place) for place in monitor.primaries.places_px]
-    channels, rates_by = named_channels(config.tracker, folder), partial(channel_rates, config.sky)
-    psf = (
-        before_detector(config, folder, bench_camera(config, folder))
-        if len(channels) == 1
-        else None
-    )
+    channels = named_channels(config.tracker, folder)
+    rates_by = partial(channel_rates, config.sky)
+    if len(channels) == 1:
+        psf = before_detector(config, folder, bench_camera(config, folder))
+    else:
+        psf = None
     return mixed_for(
         primaries, channels, places_px, rates_by, star_kinds(config, catalog), psf
     ).for_stars(catalog)
@@ -63,5 +64,7 @@ def primary_panels(
     monitor = file.config.monitor
     name = name or monitor.calibration
     responses = primary_responses(name if name in BUILT_IN else file.folder / name, monitor.bits)
-    each = zip(responses, colours.of_white.tolist(), strict=True)
-    return tuple(Panel(response, white_e_per_s * share, uniformity) for response, share in each)
+    response_shares = zip(responses, colours.of_white.tolist(), strict=True)
+    return tuple(
+        Panel(response, white_e_per_s * share, uniformity) for response, share in response_shares
+    )

@@ -79,13 +79,13 @@ class Scenario:
         """The faults as `prepare` returns them. Raises InputError with the file and the fault
         where `prepare` does.
         """
-        found = []
+        prepared_faults = []
         for fault in self.faults:
             try:
-                found.append(prepare(fault))
+                prepared_faults.append(prepare(fault))
             except InputError as error:
                 raise InputError(f"{self.path}: [[fault]] ({fault.name}): {error}") from error
-        return found
+        return prepared_faults
 
 
 NO_SCENARIO = Scenario(Path(), "")
@@ -140,17 +140,20 @@ def parse_scenario(path: Path, text: str) -> Scenario:
 
 def _place(number: int, table: Any) -> str:
     """The number of a fault in its file, with its name if it has one."""
-    name = table.get("name") if isinstance(table, dict) else None
-    return (
-        f"[[fault]] {number} ({shortened(name, 40)}):"
-        if isinstance(name, str) and name
-        else f"[[fault]] {number}:"
-    )
+    if isinstance(table, dict):
+        name = table.get("name")
+    else:
+        name = None
+    if isinstance(name, str) and name:
+        return f"[[fault]] {number} ({shortened(name, 40)}):"
+    return f"[[fault]] {number}:"
 
 
 def lasts_ns(fault: Fault) -> int | None:
     """How long a fault lasts; None without an end."""
-    return None if fault.for_s is None else round(fault.for_s * NS_PER_S)
+    if fault.for_s is None:
+        return None
+    return round(fault.for_s * NS_PER_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +180,8 @@ class Timetable:
         self._entries = []
         for number, fault in enumerate(scenario.prepared(prepare), start=1):
             if fault.at_s is not None:
-                begin_ns, length_ns = round(fault.at_s * NS_PER_S), lasts_ns(fault)
+                begin_ns = round(fault.at_s * NS_PER_S)
+                length_ns = lasts_ns(fault)
                 self._entries.append(
                     ScheduledFault(
                         number, fault, begin_ns, None if length_ns is None else begin_ns + length_ns
@@ -215,14 +219,14 @@ class Timetable:
         while True:
             at_ns = t_ns if since_ns is None else since_ns - 1
             stuck = [
-                one
-                for one in self.on(at_ns)
-                if isinstance(one.fault, Freeze)
-                or (isinstance(one.fault, Drop) and one.fault.share == 1)
+                active
+                for active in self.on(at_ns)
+                if isinstance(active.fault, Freeze)
+                or (isinstance(active.fault, Drop) and active.fault.share == 1)
             ]
             if not stuck:
                 return since_ns
-            since_ns = min(at_ns - one.since_ns for one in stuck)
+            since_ns = min(at_ns - active.since_ns for active in stuck)
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,7 +271,8 @@ class FaultSchedule:
     ) -> None:
         self.scenario = scenario
         self._frame_ns = round(frame_s * NS_PER_S)
-        self._prepare, self._listen = prepare, listen
+        self._prepare = prepare
+        self._listen = listen
         self._zero_ns: int | None = None
         self._last_ns: int | None = None
         self._count = 0
@@ -300,11 +305,10 @@ class FaultSchedule:
         fault = self._listed.get(name)
         if fault is None:
             known = ", ".join(self.names())
-            advice = (
-                f"{did_you_mean(name, self.names())}known are {known}"
-                if known
-                else "the run has no scenario"
-            )
+            if known:
+                advice = f"{did_you_mean(name, self.names())}known are {known}"
+            else:
+                advice = "the run has no scenario"
             raise InputError(f"no fault is called {name!r}; {advice}")
         self._ask(_Planned(fault, who, None))
 
@@ -376,10 +380,10 @@ class FaultSchedule:
             return ()
         run_ns = t_ns - self._zero_ns
         with self._lock:
-            changes, found = self._step(run_ns)
+            changes, active = self._step(run_ns)
         for change in changes:
             self._listen(change)
-        return found
+        return active
 
     def _step(self, run_ns: int) -> tuple[list[FaultChange], tuple[Now, ...]]:
         changes: list[FaultChange] = []
@@ -389,7 +393,7 @@ class FaultSchedule:
                 changes.append(self._ended(planned, run_ns, self._stops[planned.fault.name]))
         self._stops.clear()
         self._admit(run_ns)
-        found: list[Now] = []
+        active: list[Now] = []
         for planned in self._on[:]:
             since_ns = run_ns - (planned.start_ns or 0)
             share = share_on(planned.fault, since_ns, self._frame_ns)
@@ -400,7 +404,7 @@ class FaultSchedule:
                     FaultChange("start", planned.number, planned.fault, run_ns, planned.who)
                 )
             if share:
-                found.append(Now(planned.number, planned.fault, since_ns, share))
+                active.append(Now(planned.number, planned.fault, since_ns, share))
             elif since_ns > 0:
                 self._on.remove(planned)
                 if planned.number:
@@ -408,18 +412,17 @@ class FaultSchedule:
                 elif self._last_ns is not None and (planned.start_ns or 0) > self._last_ns:
                     changes.append(FaultChange("missed", 0, planned.fault, run_ns, planned.who))
         self._last_ns = run_ns
-        return changes, tuple(found)
+        return changes, tuple(active)
 
     def _ended(self, planned: _Planned, run_ns: int, who: str) -> FaultChange:
         return FaultChange("end", planned.number, planned.fault, run_ns, who or planned.who)
 
     def _admit(self, run_ns: int) -> None:
         """Let in what may be on within this frame."""
-        soon = [
-            p
-            for p in (*self._asked, *self._planned)
-            if p.start_ns is None or p.start_ns < run_ns + 2 * self._frame_ns
-        ]
+        soon = []
+        for p in (*self._asked, *self._planned):
+            if p.start_ns is None or p.start_ns < run_ns + 2 * self._frame_ns:
+                soon.append(p)
         names = {planned.fault.name for planned in self._on}
         for planned in soon:
             (self._asked if planned in self._asked else self._planned).remove(planned)
@@ -447,8 +450,6 @@ def share_on(fault: Fault, since_ns: int, frame_ns: int) -> float:
         return float(
             begun and (length_ns is None or since_ns + frame_ns // 2 < max(length_ns, frame_ns))
         )
-    begin_ns, end_ns = (
-        max(0, -since_ns),
-        frame_ns if length_ns is None else min(frame_ns, length_ns - since_ns),
-    )
+    begin_ns = max(0, -since_ns)
+    end_ns = frame_ns if length_ns is None else min(frame_ns, length_ns - since_ns)
     return max(0, end_ns - begin_ns) / frame_ns

@@ -70,7 +70,9 @@ class Display(NamedTuple):
 
 def scenes_of(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
     """The scene of each way to draw a bench's stars, from the cheapest on."""
-    camera, drive, render = display.camera, display.drive, file.config.render
+    camera = display.camera
+    drive = display.drive
+    render = file.config.render
     for psf, choice in display_psfs(file.config, file.folder, camera):
         white_e_per_s = white_of(render, stars, psf, drive)
         light = Light(
@@ -102,7 +104,8 @@ def plan_scene(render: RenderSettings, scenes: Iterator[Scene]) -> tuple[Scene, 
     """
     near: list[tuple[Scene, Effort]] = []
     for scene in scenes:
-        effort, choice = plan_effort(render, scene.light), scene.choice
+        effort = plan_effort(render, scene.light)
+        choice = scene.choice
         if choice is None:
             return scene, effort
         is_last = choice.choice == WHOLE
@@ -134,7 +137,8 @@ def turning_of(config: BenchConfig, on_screen: bool) -> float | None:
     A frame has them where they are at the middle of the middle row's light. The first and the last
     row light up half a scan-out earlier and later, and the motion counts to the last row's end.
     """
-    motion, scan = config.render.motion, scan_of(config.monitor)
+    motion = config.render.motion
+    scan = scan_of(config.monitor)
     moves = motion == "on" or (motion == "auto" and on_screen)
     if not moves or not scan.longest_s:
         return None
@@ -176,7 +180,10 @@ def brightest_peak_e_per_s(
     clip. With the default magnitude and a catalogue of brighter stars alone, none does. Raises
     InputError when no star remains.
     """
-    magnitude = DEFAULT_BRIGHTEST_V_MAG if brightest_v_mag is None else brightest_v_mag
+    if brightest_v_mag is None:
+        magnitude = DEFAULT_BRIGHTEST_V_MAG
+    else:
+        magnitude = brightest_v_mag
     rates = stars.electrons_per_s * drive
     wanted = rates[stars.v_mag >= magnitude]
     if not len(wanted) and magnitude == DEFAULT_BRIGHTEST_V_MAG:

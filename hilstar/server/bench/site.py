@@ -69,26 +69,28 @@ def site_extinction(site: SiteSettings, folder: Path) -> Curve:
                 f" {MAX_EXTINCTION:g}"
             )
         return constant_curve(float(site.extinction))
-    found = extinction_curve(site.extinction)
-    if found is None:
-        path, names = folder / site.extinction, extinction_names()
+    curve = extinction_curve(site.extinction)
+    if curve is None:
+        path = folder / site.extinction
+        names = extinction_names()
         if not exists(path):
             near = did_you_mean(site.extinction, names)
             raise InputError(
                 f"[site] extinction = {site.extinction!r}: no such place or file {path};"
                 f" {near}write one of {', '.join(names)}, a CSV path or a number"
             )
-        found = read_curve_csv(path, MAX_EXTINCTION)
-    return found
+        curve = read_curve_csv(path, MAX_EXTINCTION)
+    return curve
 
 
 def site_refraction(site: SiteSettings, optics: Optics) -> tuple[float, float]:
     """The constants of refraction for the colour in which a tracker sees sunlight."""
     nm, response = electron_response(optics)
     mean_nm = float(nm @ response / response.sum())
-    pressure = (
-        standard_pressure_hpa(site.height_m) if site.pressure_hpa is None else site.pressure_hpa
-    )
+    if site.pressure_hpa is None:
+        pressure = standard_pressure_hpa(site.height_m)
+    else:
+        pressure = site.pressure_hpa
     a, b = erfa.refco(pressure, site.temperature_c, site.humidity, mean_nm * 1e-3)
     return float(a), float(b)
 
@@ -100,7 +102,10 @@ def site_glow_e_per_s_sr(config: BenchConfig, folder: Path, optics: Optics) -> f
     site = config.site
     if site is None or site.sky_v_mag_arcsec2 is None:
         return 0.0
-    source = NIGHT_SKY if site.sky_spectrum == "paranal" else folder / site.sky_spectrum
+    if site.sky_spectrum == "paranal":
+        source = NIGHT_SKY
+    else:
+        source = folder / site.sky_spectrum
     photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
     rate = glow_e_per_s_arcsec2(
         read_curve_csv(source, 1e30), site.sky_v_mag_arcsec2, optics, photometry

@@ -39,7 +39,9 @@ class StarGlass:
     def __init__(
         self, file: BenchFile, psf: Psf, optics: Optics | None = None, band_nm: float = BAND_NM
     ) -> None:
-        self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
+        self.psf = psf
+        self._config = file.config
+        self._mean = psf.mean_shares
         self._catalog: Catalog | None = None
         self._of_row = np.empty((0, 0))
         self._bands: list[StarRates] = []
@@ -63,7 +65,9 @@ class StarGlass:
             np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)]
         )
         efficiency = optics.quantum_efficiency(knots_nm)
-        shares, of_band, flat = NodeSpline(self.psf.wavelengths_nm)(knots_nm), [], []
+        shares = NodeSpline(self.psf.wavelengths_nm)(knots_nm)
+        of_band = []
+        flat = []
         for number in range(len(nodes_nm)):
             part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
             response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
@@ -94,25 +98,25 @@ class StarGlass:
                 stars.catalog,
                 np.full((len(stars.catalog), self._of_band.shape[1]), np.nan),
             )
-        found = np.tile(self._mean, (len(which), 1))
+        spectra_shares = np.tile(self._mean, (len(which), 1))
         rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
-        listed, body = rows >= 0, (rows < 0) & (which >= 0)
+        listed = rows >= 0
+        body = (rows < 0) & (which >= 0)
         new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
         if len(new):
             some = stars.catalog.taken(new)
             self._of_row[new] = self._through(
                 some.bv_mag, some.vi_mag, star_kinds(self._config, some)
             )
-        found[listed] = self._of_row[rows[listed]]
+        spectra_shares[listed] = self._of_row[rows[listed]]
         if body.any():
             bv_mag = stars.bv_mag[which[body]]
-            kind = (
-                np.full((len(bv_mag), 2), np.nan)
-                if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None
-                else None
-            )
-            found[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
-        return found
+            if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None:
+                kind = np.full((len(bv_mag), 2), np.nan)
+            else:
+                kind = None
+            spectra_shares[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
+        return spectra_shares
 
     def shares_of(self, stars: Stars, hip: IntArray) -> FloatArray:
         """The same by Hipparcos numbers (n,) of `stars`, 0 for a body."""
@@ -131,4 +135,6 @@ class StarGlass:
 
 def star_glass(file: BenchFile, psf: Psf, optics: Optics | None = None) -> StarGlass | None:
     """The spectra of a bench's stars as `psf` has them; None for one that is the same for all."""
-    return StarGlass(file, psf, optics) if psf.by_colour else None
+    if psf.by_colour:
+        return StarGlass(file, psf, optics)
+    return None

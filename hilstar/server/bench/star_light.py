@@ -57,14 +57,16 @@ SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
 
 def bench_sources(config: BenchConfig, folder: Path) -> Sources:
     """The light of a bench's sky beside its stars. Raises InputError or MachineError."""
-    moving, diffuse = bench_moving(config, folder), config.sky.diffuse
+    moving = bench_moving(config, folder)
+    diffuse = config.sky.diffuse
     if diffuse.map is None:
         return Sources(moving)
     # WCS and coordinates take 200 ms, which only a map needs
     from hilstar.sky.diffuse import read_diffuse_map
 
-    one, bv_mag = np.ones(1), diffuse.bv_mag
-    v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, bv_mag * one, np.nan * one)[0])
+    ones = np.ones(1)
+    bv_mag = diffuse.bv_mag
+    v0_e_per_s = np.float32(star_rates(config, folder)(0 * ones, bv_mag * ones, np.nan * ones)[0])
     faces = read_diffuse_map(folder / diffuse.map)
     return Sources(
         moving,
@@ -108,7 +110,10 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     """
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
-    faintest = math.inf if sky.variables == "phase" else sky.faintest_v_mag
+    if sky.variables == "phase":
+        faintest = math.inf
+    else:
+        faintest = sky.faintest_v_mag
     chosen = choose_catalog(
         dataclasses.replace(catalogue_choice(config, folder), faintest_v_mag=faintest)
     )
@@ -130,7 +135,8 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
         )
         catalog = dataclasses.replace(catalog, notes=(*catalog.notes, note))
     through = star_flux(config, folder)
-    flux, by_bv = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind), None
+    flux = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind)
+    by_bv = None
     if flux.shape[1] > 1:
         by_bv = total_and_colours(through(0 * BV_MAG, BV_MAG, np.full_like(BV_MAG, np.nan))).colours
     # the air takes of each star by its own spectrum
@@ -155,18 +161,26 @@ def site_air(
 
     if config.site is None:
         raise AssertionError("the file has a site")
-    extinction, optics = site_extinction(config.site, folder), bench_optics(config.tracker, folder)
+    extinction = site_extinction(config.site, folder)
+    optics = bench_optics(config.tracker, folder)
     channels = bench_channels(config.tracker, folder)
     v, bv, vi = (
-        np.append(c, one)
-        for c, one in zip((catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True)
+        np.append(c, sunlight)
+        for c, sunlight in zip(
+            (catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True
+        )
     )
-    kinds = None if kind is None else np.vstack([kind, np.full((1, 2), np.nan)])
+    if kind is None:
+        kinds = None
+    else:
+        kinds = np.vstack([kind, np.full((1, 2), np.nan)])
     dimming = [
         dimmed_mag(
-            lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction
+            lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds),
+            sunlight,
+            extinction,
         )
-        for one in channels
+        for sunlight in channels
     ]
     return SiteAir(
         up_at=Ground(config.site).up,
@@ -175,7 +189,9 @@ def site_air(
         aperture_mm=config.tracker.aperture_mm,
         dimming_mag=np.array(dimming, dtype=np.float32),
         v_extinction_mag=float(extinction(np.array([V_NM]))[0]),
-        glow_e_per_s_sr=np.array([site_glow_e_per_s_sr(config, folder, one) for one in channels]),
+        glow_e_per_s_sr=np.array(
+            [site_glow_e_per_s_sr(config, folder, sunlight) for sunlight in channels]
+        ),
     )
 
 

@@ -38,10 +38,9 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
     relative to `folder`.
     """
     given = tracker.quantum_efficiencies.items()
-    efficiencies = [
-        load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES)
-        for key, source in given
-    ]
+    efficiencies = []
+    for key, source in given:
+        efficiencies.append(load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES))
     transmission = glass_transmission(tracker, folder)
     if not any(_sees_v(curve) for curve in efficiencies):
         names = ", ".join(tracker.quantum_efficiencies)
@@ -53,10 +52,10 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
     return tuple(
         Optics(
             tracker.aperture_mm,
-            Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor),
+            Curve(efficiency.wavelength_nm, efficiency.value * tracker.detector.fill_factor),
             transmission,
         )
-        for one in efficiencies
+        for efficiency in efficiencies
     )
 
 
@@ -89,11 +88,9 @@ def star_kinds(config: BenchConfig, catalog: Catalog) -> FloatArray | None:
     """The types (n, 2) of stars, as `star_types` reads them, where a bench's spectra follow
     types; None elsewhere.
     """
-    return (
-        star_types(catalog)
-        if (config.sky.brightness, config.sky.spectrum) == ("dgs", "mk")
-        else None
-    )
+    if (config.sky.brightness, config.sky.spectrum) == ("dgs", "mk"):
+        return star_types(catalog)
+    return None
 
 
 def star_rates(config: BenchConfig, folder: Path) -> StarRates:

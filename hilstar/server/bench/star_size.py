@@ -96,8 +96,8 @@ class StarRemedy:
         collimator = f"a collimator of {self.collimator_mm:.4g} mm"
         if self.field_fits:
             return f"{collimator} would do, or {panel}"
-        left = f"{100 * (self.field_on_screen or 0.0):.0f} % of the tracker's field"
-        return f"{panel} would do; {collimator} leaves {left} on this screen"
+        field_text = f"{100 * (self.field_on_screen or 0.0):.0f} % of the tracker's field"
+        return f"{panel} would do; {collimator} leaves {field_text} on this screen"
 
     def lines(self) -> Iterator[str]:
         """The table of panels, for a person."""
@@ -105,12 +105,14 @@ class StarRemedy:
             f"{'panel':24}{'pitch':>8}  collimator, its star within the limit and the field on the"
             " screen"
         )
-        for one in self.panels:
-            lengths = f"none: the star is {one.sigma_ratio:.1f} times as wide where the field fits"
-            if one.collimator_mm is not None:
-                low, high = one.collimator_mm
+        for option in self.panels:
+            lengths = (
+                f"none: the star is {option.sigma_ratio:.1f} times as wide where the field fits"
+            )
+            if option.collimator_mm is not None:
+                low, high = option.collimator_mm
                 lengths = f"{low:.0f} to {high:.0f} mm"
-            yield f"{one.panel:24}{one.pixel_pitch_um:5.1f} um  {lengths}"
+            yield f"{option.panel:24}{option.pixel_pitch_um:5.1f} um  {lengths}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,12 +183,15 @@ class _Widths:
     def largest_ratio(self, limit: float) -> float | None:
         """The largest of those at which that is within the limit; None where none is."""
         left_px2 = limit**2 * (self.sky_px2 + PIXEL_VARIANCE) - PIXEL_VARIANCE - self.fixed_px2
-        return math.sqrt(left_px2 / self.by_ratio) if left_px2 > NOTHING_PX2 else None
+        if left_px2 > NOTHING_PX2:
+            return math.sqrt(left_px2 / self.by_ratio)
+        return None
 
 
 def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
     """The star of a bench whose monitor stands as `display` has it. Raises InputError."""
-    tracker, limit = tracker_camera(config.tracker, folder), config.verify.star_sigma_ratio
+    tracker = tracker_camera(config.tracker, folder)
+    limit = config.verify.star_sigma_ratio
     ratio = tracker.focal_length_px / display.focal_length_px
     sprite = display_psf(config, folder, display)
     lens, sky = (
@@ -204,7 +209,8 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
         - (blur_px * ratio) ** 2
         + (0.0 if goes_along else sprite_px2 * ratio**2),
     )
-    shown, of_sky = _shown_shares(sprite, lens, ratio), _sky_shares(sky)
+    shown = _shown_shares(sprite, lens, ratio)
+    of_sky = _sky_shares(sky)
     sigma_ratio = widths.sigma_ratio(ratio)
     return StarSize(
         sigma_px=math.sqrt(widths.by_ratio * ratio**2 + widths.fixed_px2),
@@ -240,8 +246,8 @@ def _shown_shares(sprite: Psf, lens: Psf, ratio: float) -> _Shares:
     if ratio > FINEST:
         coarser = ratio / FINEST
         wide, high = lens.width_px
-        found = _shown_shares(sprite, GaussianPsf((wide / coarser, high / coarser)), FINEST)
-        return _Shares(found.peak / coarser**2, found.shared_px * coarser**2)
+        shares = _shown_shares(sprite, GaussianPsf((wide / coarser, high / coarser)), FINEST)
+        return _Shares(shares.peak / coarser**2, shares.shared_px * coarser**2)
     reach = sprite.footprint_px // 2 + 1
     pixels = np.arange(-reach, reach + 1)
     weights = sprite.shares(*np.meshgrid(pixels.astype(np.float64), pixels.astype(np.float64)))
@@ -312,10 +318,18 @@ def _panel_option(
     largest: float | None,
 ) -> PanelOption:
     pitch_mm = inches * MM_PER_INCH / math.hypot(*size_px)
-    pixels_a_side = min(one / its for one, its in zip(size_px, tracker.resolution_px, strict=True))
+    pixels_a_side = min(
+        screen_px / its for screen_px, its in zip(size_px, tracker.resolution_px, strict=True)
+    )
     longest_mm = pixels_a_side * tracker.focal_length_px * pitch_mm
-    shortest_mm = math.inf if largest is None else tracker.focal_length_px * pitch_mm / largest
-    lengths = (shortest_mm, longest_mm) if shortest_mm <= longest_mm else None
+    if largest is None:
+        shortest_mm = math.inf
+    else:
+        shortest_mm = tracker.focal_length_px * pitch_mm / largest
+    if shortest_mm <= longest_mm:
+        lengths = (shortest_mm, longest_mm)
+    else:
+        lengths = None
     return PanelOption(
         name, size_px, pitch_mm * UM_PER_MM, lengths, widths.sigma_ratio(1 / pixels_a_side)
     )

@@ -121,7 +121,8 @@ class _Trials:
         )
 
     def _response(self, trial: _Trial) -> Response:
-        start, stealing = self.start, trial.render.bit_stealing
+        start = self.start
+        stealing = trial.render.bit_stealing
         if (trial.bits, stealing) == (start.bits, start.render.bit_stealing):
             return self._bench.effort.light.response
         file = self._bench.file
@@ -206,9 +207,9 @@ def would_do(bench: Bench) -> list[Remedy]:
         return []
     trials = _Trials(bench)
     alone = [_first_within(trials, way(trials.start)) for way in trials.ways]
-    found = _remedies(trials, alone)
-    if found:
-        return found
+    remedies = _remedies(trials, alone)
+    if remedies:
+        return remedies
     pairs = _remedies(trials, _pairs(trials))
     if pairs:
         return pairs
@@ -228,16 +229,16 @@ def _remedies(trials: _Trials, some: Sequence[_Trial | None]) -> list[Remedy]:
 
 def _pairs(trials: _Trials) -> list[_Trial]:
     """The first pairs of keys within the tolerance, each with the smallest changes that do."""
-    found: list[_Trial] = []
+    pairs: list[_Trial] = []
     by_cost = sorted(combinations(range(len(trials.ways)), 2), key=lambda pair: pair[::-1])
     for pair in by_cost:
         cheaper, dearer = (trials.ways[place] for place in pair)
         trial = _smallest_pair(trials, cheaper, dearer)
         if trial is not None:
-            found.append(trial)
-        if len(found) == MAX_PAIRS:
+            pairs.append(trial)
+        if len(pairs) == MAX_PAIRS:
             break
-    return found
+    return pairs
 
 
 def _smallest_pair(

@@ -44,14 +44,16 @@ def parse_address(text: str, option: str = "--console") -> ListenAddress:
     """ "HOST:PORT", "HOST", ":PORT" or "PORT" of --console or --scpi. Raises InputError."""
     wrong = InputError(f"{option} {shortened(text)}: {_form(option)}")
     if text.isdecimal() and text.isascii():
-        host, port = HOST, text
+        host = HOST
+        port = text
     elif text.startswith("["):
         host, bracket, rest = text[1:].partition("]")
         if not bracket or (rest and not rest.startswith(":")):
             raise wrong
         port = rest[1:]
     elif text.count(":") > 1:
-        host, port = text, ""
+        host = text
+        port = ""
     else:
         host, _, port = text.partition(":")
     if port and not (
@@ -111,10 +113,10 @@ class PageListener(Closing):
         """The host names under which a browser may ask for the page, besides numeric addresses
         where `any_address`.
         """
-        own = ["localhost", "127.0.0.1", "[::1]", _bracketed(self.host)]
+        own_hosts = ["localhost", "127.0.0.1", "[::1]", _bracketed(self.host)]
         if self.any_address:
-            own += [socket.gethostname(), socket.getfqdn()]
-        return sorted({name.lower() for name in own})
+            own_hosts += [socket.gethostname(), socket.getfqdn()]
+        return sorted({name.lower() for name in own_hosts})
 
     @property
     def url(self) -> str:
@@ -149,14 +151,14 @@ def _bracketed(host: str) -> str:
 def _listen(address: ListenAddress, option: str) -> socket.socket:
     where = f"{_bracketed(address.host)}:{address.port}"
     try:
-        found = socket.getaddrinfo(
+        addresses = socket.getaddrinfo(
             address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )
     except (OSError, UnicodeError) as error:
         raise InputError(
             f"{option} {where}: no such host ({getattr(error, 'strerror', error)}); {_form(option)}"
         ) from error
-    family, kind, protocol, _, place = found[0]
+    family, kind, protocol, _, place = addresses[0]
     listener = socket.socket(family, kind, protocol)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -175,7 +175,8 @@ class Ring:
 
     def __init__(self, memory: memoryview, slots: int, slot_bytes: int) -> None:
         self._memory = memory
-        self._slots, self._stride = slots, _SLOT.size + slot_bytes
+        self._slots = slots
+        self._stride = _SLOT.size + slot_bytes
         self.slot_bytes = slot_bytes
         self._next = self.newest + 1
 
@@ -222,7 +223,9 @@ class Ring:
         data = bytes(self._memory[place + _SLOT.size : place + _SLOT.size + length])
         if _SLOT.unpack_from(self._memory, place) != (begun, whole, length, crc):
             return None
-        return data if not crc or zlib.crc32(data) == crc else None
+        if not crc or zlib.crc32(data) == crc:
+            return data
+        return None
 
     def last(self) -> tuple[int, bytes] | None:
         """The newest complete record with its number; None where there is none yet."""

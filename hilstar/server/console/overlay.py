@@ -120,8 +120,10 @@ class CameraMarks:
         ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
         radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
         step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
-        low_deg, high_deg = max(dec_deg - radius_deg, -90.0), min(dec_deg + radius_deg, 90.0)
-        wide_deg, ra_step_deg = 180.0, 30.0
+        low_deg = max(dec_deg - radius_deg, -90.0)
+        high_deg = min(dec_deg + radius_deg, 90.0)
+        wide_deg = 180.0
+        ra_step_deg = 30.0
         # the widest circle of right ascension that the field touches
         if max(-low_deg, high_deg) < 90.0:
             share = math.sin(math.radians(min(radius_deg, 89.0))) / math.cos(math.radians(dec_deg))
@@ -176,7 +178,10 @@ class Overlay:
         is_body = bright >= len(self.stars) - bodies
         rays = self.monitor.rays(*_border(self.monitor.resolution_px, 2))
         known = np.isfinite(rays).all()
-        corners = rays / np.linalg.norm(rays, axis=1, keepdims=True) if known else rays[:0]
+        if known:
+            corners = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        else:
+            corners = rays[:0]
         return SkyMap(
             self._places(bright[~is_body]),
             self._places(bright[is_body]),
@@ -185,10 +190,8 @@ class Overlay:
 
     def _places(self, which: np.ndarray[Any, Any]) -> list[SkyPlace]:
         x, y, z = self.stars.directions(which).T
-        ra_deg, dec_deg = (
-            np.degrees(np.arctan2(y, x)) % 360.0,
-            np.degrees(np.arctan2(z, np.hypot(x, y))),
-        )
+        ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
+        dec_deg = np.degrees(np.arctan2(z, np.hypot(x, y)))
         v_mag = self.stars.v_mag[which].round(2).tolist()
         places = ra_deg.round(SKY_DIGITS).tolist(), dec_deg.round(SKY_DIGITS).tolist()
         return [SkyPlace(*row) for row in zip(*places, v_mag, self._labels(which, ""), strict=True)]
@@ -199,11 +202,9 @@ class Overlay:
         """
         found = zip(self.stars.names(which), self.stars.hip[which].tolist(), strict=True)
         labels = [name or label_of(hip) for name, hip in found]
-        return (
-            labels
-            if none is None
-            else [none if label.startswith("HIP ") else label for label in labels]
-        )
+        if none is None:
+            return labels
+        return [none if label.startswith("HIP ") else label for label in labels]
 
     def truth(
         self, frame: int, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = ()
@@ -218,7 +219,8 @@ class Overlay:
         inside = inside[np.argsort(self.stars.v_mag[near[inside]], kind="stable")][:MAX_STARS]
         which = near[inside]
         marked = set(clipped)
-        hips, names = self.stars.hip[which].tolist(), self.stars.names(which)
+        hips = self.stars.hip[which].tolist()
+        names = self.stars.names(which)
         columns = (
             x_px[inside].round(PX_DIGITS).tolist(),
             y_px[inside].round(PX_DIGITS).tolist(),
@@ -278,7 +280,11 @@ def _multiples(low: float, high: float, step: float) -> list[float]:
 
 
 def _digits(step_deg: float) -> int:
-    return 0 if step_deg >= 1 else 1 if step_deg >= 0.1 else 2
+    if step_deg >= 1:
+        return 0
+    if step_deg >= 0.1:
+        return 1
+    return 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,21 +315,25 @@ def colour_notes(bench: "Bench") -> dict[int, str]:
     """The colours of a bench's brightest shown stars, where its primaries are driven apart: by
     channel, or mean wavelength.
     """
-    colours, stars = bench.colours, bench.shown_stars
+    colours = bench.colours
+    stars = bench.shown_stars
     if colours is None:
         return {}
     which = np.argsort(stars.v_mag[: len(stars.rates_e_per_s)], kind="stable")[:MAX_COLOURS]
-    wanted, shares = colours.wanted(stars, which), colours.shares_of(stars, which)
+    wanted = colours.wanted(stars, which)
+    shares = colours.shares_of(stars, which)
     notes = []
-    for own, shown in zip(wanted.tolist(), colours.shown(shares).tolist(), strict=True):
+    for own_shares, shown in zip(wanted.tolist(), colours.shown(shares).tolist(), strict=True):
         if colours.mono:
             notes.append(
-                f"{own[0]:.0f} nm"
-                + ("" if abs(own[0] - shown[0]) < 1 else f", shown {shown[0]:.0f} nm")
+                f"{own_shares[0]:.0f} nm"
+                + ("" if abs(own_shares[0] - shown[0]) < 1 else f", shown {shown[0]:.0f} nm")
             )
         else:
             notes.append(
-                " ".join(f"{name} {share:.0%}" for name, share in zip(PRIMARIES, own, strict=True))
+                " ".join(
+                    f"{name} {share:.0%}" for name, share in zip(PRIMARIES, own_shares, strict=True)
+                )
             )
     reached = colours.in_gamut(colours.off(wanted, shares)).tolist()
     said = (

@@ -75,8 +75,13 @@ class PageProcess(Closing):
         notices: Notices,
         do: Do,
     ) -> None:
-        self._memory, self._now, self._notices, self._do = memory, now, notices, do
-        self._listener_fds = [-1 if each is None else each.socket.fileno() for each in listeners]
+        self._memory = memory
+        self._now = now
+        self._notices = notices
+        self._do = do
+        self._listener_fds = [
+            -1 if listener is None else listener.socket.fileno() for listener in listeners
+        ]
         self._setup_fd = os.memfd_create("hilstar-console-setup")
         with os.fdopen(os.dup(self._setup_fd), "wb") as file:
             file.write(msgspec.msgpack.encode(setup))
@@ -99,7 +104,9 @@ class PageProcess(Closing):
     @property
     def pid(self) -> int | None:
         """The process ID of the page's process, None while there is none."""
-        return None if self._page is None else self._page.process.pid
+        if self._page is None:
+            return None
+        return self._page.process.pid
 
     def _run(self) -> None:
         next_s = 0.0
@@ -109,7 +116,8 @@ class PageProcess(Closing):
                 next_s = now_s + TICK_S
                 self._tick(now_s)
             self._listen(max(next_s - time.monotonic(), 0.0))
-        page, self._page = self._page, None
+        page = self._page
+        self._page = None
         if page is None:
             return
         page.channel.close()  # which tells it to end
@@ -143,7 +151,10 @@ class PageProcess(Closing):
         elif (code := page.process.poll()) is not None:
             page.channel.close()
             self._page = None
-            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            if code < 0:
+                how = f"signal {-code}"
+            else:
+                how = f"exit code {code}"
             self._lose(f"the operator's page ended ({how})", anew=now_s - page.begun_s > STEADY_S)
 
     def _start_page(self, now_s: float) -> None:

@@ -291,7 +291,9 @@ class PageWants(msgspec.Struct):
     @property
     def picture_hz(self) -> float:
         """How often it wants pictures, within bounds; 0 for never."""
-        return min(max(self.hz, MIN_HZ), MAX_HZ) if self.picture else 0.0
+        if self.picture:
+            return min(max(self.hz, MIN_HZ), MAX_HZ)
+        return 0.0
 
 
 class PageMessage(msgspec.Struct):

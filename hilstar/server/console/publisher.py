@@ -95,10 +95,12 @@ class FramePublisher:
         """Publish a frame. Called by the frame loop."""
         self.shown = shown
         self.count += 1
-        running, attitude = self.running, shown.attitude
+        running = self.running
+        attitude = shown.attitude
         if running is None:
             return
-        tally, packets = running.loop.tally, running.packets
+        tally = running.loop.tally
+        packets = running.packets
         flags = (
             messages.STALE * shown.stale
             | messages.MISSING * shown.missing
@@ -130,18 +132,21 @@ class FramePublisher:
                 self._copy(shown)
 
     def _copy(self, shown: "Shown") -> None:
-        drawn, sprites = shown.drawn.levels, shown.drawn.sprites
+        drawn = shown.drawn.levels
+        sprites = shown.drawn.sprites
         levels = drawn if drawn.ndim == 2 else drawn.max(axis=2)  # the page's picture is grey
         height, width = levels.shape
         places: list[np.ndarray] = []
         if sprites is not None:
-            kept = brightest(sprites.data["electrons_per_s"], messages.MAX_SPRITES)
-            places = [
-                part if kept is None else part[kept]
-                for part in (sprites.star, sprites.x_px, sprites.y_px)
-            ]
+            brightest_rows = brightest(sprites.data["electrons_per_s"], messages.MAX_SPRITES)
+            places = []
+            for part in (sprites.star, sprites.x_px, sprites.y_px):
+                places.append(part if brightest_rows is None else part[brightest_rows])
         count = len(places[0]) if places else 0
-        q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
+        if shown.attitude is None:
+            q = ()
+        else:
+            q = shown.attitude.q_icrs_to_cam.tolist()
         head = messages.PictureHead(
             shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q
         )
@@ -165,15 +170,22 @@ class WatchedRun:
     """The state of a run, read from its parts beside the frame loop."""
 
     def __init__(self, feed: FramePublisher, parts: PageParts) -> None:
-        self._feed, self._parts, self._notices = feed, parts, parts.notices
+        self._feed = feed
+        self._parts = parts
+        self._notices = parts.notices
 
     def now(self) -> messages.RunState:
         """The run's current state, read beside the frame loop."""
-        running, shown = self._feed.running, self._feed.shown
+        running = self._feed.running
+        shown = self._feed.shown
         if running is None:
             return messages.RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
-        tally, aids, packets = running.loop.tally, running.loop.pacer.operator.aids, running.packets
-        screen, faults, newest = self._parts.screen, self._parts.faults, protocol.NewestFrame()
+        tally = running.loop.tally
+        aids = running.loop.pacer.operator.aids
+        packets = running.packets
+        screen = self._parts.screen
+        faults = self._parts.faults
+        newest = protocol.NewestFrame()
         if shown is not None:
             newest = protocol.NewestFrame(
                 number=shown.number,
@@ -211,7 +223,8 @@ class WatchedRun:
             faults=[] if faults is None else faults.on(),
             pointing=self._notices.lasting.get(POINTING, ""),
             wrong_sky=[
-                protocol.WrongCondition(one.kind, one.text) for one in self._notices.wrong_sky.now()
+                protocol.WrongCondition(condition.kind, condition.text)
+                for condition in self._notices.wrong_sky.now()
             ],
             wrong_sky_s=self._wrong_sky_s(tally.first_swap_ns),
             tracker=None if running.answers is None else running.answers.figures,
@@ -227,9 +240,10 @@ class WatchedRun:
         ledger = self._parts.ledger.current
         if ledger is None:
             return None
-        troubles = [
-            words for kind, words in LEDGER_TROUBLES.items() if kind in self._notices.active
-        ]
+        troubles = []
+        for kind, trouble_text in LEDGER_TROUBLES.items():
+            if kind in self._notices.active:
+                troubles.append(trouble_text)
         return protocol.LedgerState(
             printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles)
         )
@@ -253,7 +267,10 @@ def _attitude(shown: "Shown | None") -> protocol.ShownAttitude | None:
 
 
 def _clock(running: "Running") -> protocol.ShownClock | None:
-    clock = None if running.clock is None else running.clock()
+    if running.clock is None:
+        clock = None
+    else:
+        clock = running.clock()
     if clock is None or clock.mode == "none":
         return None
     return protocol.ShownClock(
@@ -276,12 +293,12 @@ class OrderHandler:
     """
 
     def __init__(self, requests: SwitchRequests, feed: FramePublisher, parts: PageParts) -> None:
-        self._requests, self._feed, self._faults = requests, feed, parts.faults
-        self._ledger, self._notices, self._make_ledger = (
-            parts.ledger,
-            parts.notices,
-            parts.make_ledger,
-        )
+        self._requests = requests
+        self._feed = feed
+        self._faults = parts.faults
+        self._ledger = parts.ledger
+        self._notices = parts.notices
+        self._make_ledger = parts.make_ledger
         self._ledger_lock = threading.Lock()
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:
@@ -295,7 +312,8 @@ class OrderHandler:
         try:
             status, line = doers[order.name](order, who)
         except HilstarError as error:
-            status, line = 409, one_line(str(error))
+            status = 409
+            line = one_line(str(error))
         # a ledger may be called anything
         return messages.OrderAnswer(id=order.id, status=status, line=printable(line))
 
@@ -336,7 +354,10 @@ class OrderHandler:
             return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
-        folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
+        if self._ledger.last is None:
+            folder = Path.cwd()
+        else:
+            folder = self._ledger.last.path.parent
         now = datetime.now(UTC)
         for k in range(100):
             path = folder / (f"hilstar-{now:%Y%m%dT%H%M%SZ}" + (f"-{k}" if k else "") + ".mcap")
@@ -356,7 +377,8 @@ class OrderHandler:
         if faults is None or not faults.names():
             return 409, "this run has no faults to start: give it some with --scenario"
         if order.fault not in faults.names():
-            meant, known = did_you_mean(order.fault, faults.names()), ", ".join(faults.names())
+            meant = did_you_mean(order.fault, faults.names())
+            known = ", ".join(faults.names())
             return 404, f"no fault of that name; {meant}write one of {known}"
         before = self._feed.count
         act = faults.start if order.on else faults.stop
@@ -387,7 +409,9 @@ def setup_for(
     picture_bytes: int,
 ) -> messages.Setup:
     """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
-    monitor, page, scpi = file.config.monitor, listeners.page, listeners.scpi
+    monitor = file.config.monitor
+    page = listeners.page
+    scpi = listeners.scpi
     hello = protocol.Hello(
         version=__version__,
         command=f"hilstar {description.command}",
@@ -426,7 +450,8 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
     """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids
     already.
     """
-    stars, overlay = bench.shown_stars, overlay_of(bench)
+    stars = bench.shown_stars
+    overlay = overlay_of(bench)
     unnamed = np.flatnonzero(stars.hip == 0)
     unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
     return OverlayScene(
@@ -455,8 +480,10 @@ def opened_page(
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     memory = messages.SharedMemory.make(picture_bytes)
-    feed, requests = FramePublisher(memory), SwitchRequests()
-    bench, orders = parts.bench, OrderHandler(requests, feed, parts)
+    feed = FramePublisher(memory)
+    requests = SwitchRequests()
+    bench = parts.bench
+    orders = OrderHandler(requests, feed, parts)
     setup = setup_for(listeners, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = (
         bench.renderer.gl_renderer,
@@ -498,13 +525,17 @@ class SessionPublisher:
     """
 
     def __init__(self, memory: messages.SharedMemory) -> None:
-        self._memory, self.notices = memory, _SessionNotices()
+        self._memory = memory
+        self.notices = _SessionNotices()
         self._failed: dict[str, str] = {}
         self._patterns = 0
 
     def show(self, pattern: ShownPattern) -> None:
         """Publish the pattern now shown; of a coloured one the brightest channel."""
-        codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
+        if pattern.codes.ndim == 2:
+            codes = pattern.codes
+        else:
+            codes = pattern.codes.max(axis=2)
         height, width = codes.shape
         # A step may have found that the monitor is larger than the bench file said.
         if messages.PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
@@ -518,9 +549,9 @@ class SessionPublisher:
 
     def say(self, line: str) -> None:
         """Publish a line of the session: a step begins or ends."""
-        step, _, words = line.partition(" ")
-        if step == FORCED or words.strip().startswith(FAILED):
-            self._failed[step] = f"{step} {words.strip()}"
+        step, _, step_text = line.partition(" ")
+        if step == FORCED or step_text.strip().startswith(FAILED):
+            self._failed[step] = f"{step} {step_text.strip()}"
         else:
             self._failed.pop(step, None)
         self.notices.tell("step", line)
@@ -528,10 +559,8 @@ class SessionPublisher:
     def now(self) -> messages.RunState:
         """The session's current state."""
         now_ns = time.monotonic_ns()
-        failed, shown = (
-            list(self._failed.values()),
-            protocol.NewestFrame(number=self._patterns, missing=False, blank=False),
-        )
+        failed = list(self._failed.values())
+        shown = protocol.NewestFrame(number=self._patterns, missing=False, blank=False)
         return messages.RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:

@@ -94,7 +94,8 @@ def _take(name: str, folder: Path, done: dict[str, str]) -> None:
     for _, other in wanted:
         if other not in done:
             _take(other, folder, done)
-    body, names = _import.sub("", text), _export.findall(text)
+    body = _import.sub("", text)
+    names = _export.findall(text)
     body = _export.sub("", body)
     if re.search(r"^(?:import|export)\b", body, re.MULTILINE):
         raise ValueError(
@@ -173,7 +174,8 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
 
     Raises InputError where the head has none, or one that cannot be read.
     """
-    text, named = head.get("bench_text"), Path(head.get("bench_file", "bench.toml"))
+    text = head.get("bench_text")
+    named = Path(head.get("bench_file", "bench.toml"))
     if not text:
         raise InputError(NO_BENCH)
     files = [bench_file_of(path, text) for path in (named, ledger.parent / named.name)]
@@ -192,14 +194,14 @@ def _pictures(
         for record, why in frames
         if not (frozen & set(record.faults) or wrong_in_frame(record))
     ]
-    found: list[dict[str, Any]] = []
+    pictures: list[dict[str, Any]] = []
 
     def take(shown: Shown) -> None:
-        record, why = chosen[len(found)]
+        record, why = chosen[len(pictures)]
         picture = _picture(overlay, shown)
         t_s = (record.swap_ns - run.first_swap_ns) / NS_PER_S
         told = {"why": why, "operator": record.operator, "stale": record.stale}
-        found.append(picture | told | {"t_s": round(t_s, 3)})
+        pictures.append(picture | told | {"t_s": round(t_s, 3)})
 
     if chosen:
         play = played_again(
@@ -207,20 +209,22 @@ def _pictures(
         )
         replay(bench, play, take, Outlet(notices=_Unreported()))
     # As many pictures, evenly over the run, as fit.
-    while len(found) > 1 and sum(len(picture["data"]) for picture in found) > MAX_BYTES:
-        found = found[::2]
-    return found
+    while len(pictures) > 1 and sum(len(picture["data"]) for picture in pictures) > MAX_BYTES:
+        pictures = pictures[::2]
+    return pictures
 
 
 def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
     shown_levels = shown.drawn.levels
-    levels = shown_levels if shown_levels.ndim == 2 else shown_levels.max(axis=2)
+    if shown_levels.ndim == 2:
+        levels = shown_levels
+    else:
+        levels = shown_levels.max(axis=2)
     attitude = shown.attitude
-    truth = (
-        None
-        if attitude is None
-        else overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
-    )
+    if attitude is None:
+        truth = None
+    else:
+        truth = overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
     wide = levels.dtype.itemsize == 2
     data = np.ascontiguousarray(levels, dtype="<u2" if wide else "u1").tobytes()
     return {
@@ -237,7 +241,8 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
     """The figures of a run for the page: lists of numbers, None for no value; times in s from
     the first swap.
     """
-    config, rows = config_of(run.head), table_rows(summary)
+    config = config_of(run.head)
+    rows = table_rows(summary)
     monitor = None if config is None else config.monitor
     about = {
         "run": name,
@@ -267,7 +272,7 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
             "refused": {
                 reason: count for reason, count in summary.packets.items() if reason != "accepted"
             },
-            "events": [_event(each, run) for each in (*run.first_events, *run.last_events)],
+            "events": [_event(event, run) for event in (*run.first_events, *run.last_events)],
             "events_total": sum(run.events.values()),
         }
 
@@ -287,14 +292,22 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
     if found.missed_frames:
         reasons.append(f"{found.missed_frames} refresh periods without a frame of their own")
     reasons += [
-        f"{one.seconds:.1f} s of {one.kind}: {one.text}"
-        for one in found.wrong_sky.conditions
-        if one.seconds
+        f"{condition.seconds:.1f} s of {condition.kind}: {condition.text}"
+        for condition in found.wrong_sky.conditions
+        if condition.seconds
     ]
-    headline = "Sky was right throughout" if not reasons else "Sky was not right throughout"
+    if not reasons:
+        headline = "Sky was right throughout"
+    else:
+        headline = "Sky was not right throughout"
     due = found.frames + found.missed_frames  # refresh periods in which a frame was due
     percent = 100 * found.right_frames / max(due, 1)
-    digits = 3 if percent > 99.9 else 2 if percent > 99 else 1
+    if percent > 99.9:
+        digits = 3
+    elif percent > 99:
+        digits = 2
+    else:
+        digits = 1
     # rounded down: only all of them are 100 %
     share = f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
     return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
@@ -315,14 +328,17 @@ def _numbers(values: FloatArray, digits: int) -> list[float | None]:
 
 
 def _spans(run: RunFigures) -> dict[str, Any]:
-    told: dict[str, Any] = {"t_s": _numbers(run.spans.begin, S_DIGITS), "frames": run.spans.length}
+    span_columns: dict[str, Any] = {
+        "t_s": _numbers(run.spans.begin, S_DIGITS),
+        "frames": run.spans.length,
+    }
     for number, name in enumerate((*METRICS, *COUNTS)):
         low, high, total = run.spans.column(number)
         if name in {"missed", "stale", "blank"}:
-            told[name] = _numbers(total, 0)
+            span_columns[name] = _numbers(total, 0)
         else:
-            told[name] = [_numbers(low, MS_DIGITS), _numbers(high, MS_DIGITS)]
-    return told
+            span_columns[name] = [_numbers(low, MS_DIGITS), _numbers(high, MS_DIGITS)]
+    return span_columns
 
 
 def _packets(run: RunFigures) -> dict[str, Any]:
@@ -352,7 +368,7 @@ def _process(run: RunFigures) -> dict[str, Any]:
 
 
 def _histograms(run: RunFigures) -> list[dict[str, Any]]:
-    found = []
+    histograms = []
     for name, title in DISTRIBUTIONS.items():
         values = run.samples.rows[:, list(METRICS).index(name)]
         values = values[np.isfinite(values)]
@@ -362,8 +378,8 @@ def _histograms(run: RunFigures) -> list[dict[str, Any]]:
         narrowest = max(MIN_RANGE_MS, NARROWEST * max(abs(low), abs(high)))
         counts, edges = np.histogram(values, BINS, (low, max(high, low + narrowest)))
         ends = {"from_ms": float(edges[0]), "to_ms": float(edges[-1])}
-        found.append({"name": name, "title": title, "counts": counts.tolist()} | ends)
-    return found
+        histograms.append({"name": name, "title": title, "counts": counts.tolist()} | ends)
+    return histograms
 
 
 def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
@@ -373,7 +389,8 @@ def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
     if not summary.answers:
         return None
     zero_s = run.first_swap_ns / NS_PER_S
-    rows, faults = run.residuals.rows, summary.answers.faults
+    rows = run.residuals.rows
+    faults = summary.answers.faults
     edges = sorted(
         (at_s, step)
         for f in faults
@@ -391,11 +408,10 @@ def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
 
 def _event(record: EventRecord, run: RunFigures) -> dict[str, Any]:
     t_s = (record.host_ns - run.first_swap_ns) / NS_PER_S
-    who = (
-        f" ({record.who[:MAX_WHO_CHARACTERS]})"
-        if record.who and record.who not in record.detail
-        else ""
-    )
+    if record.who and record.who not in record.detail:
+        who = f" ({record.who[:MAX_WHO_CHARACTERS]})"
+    else:
+        who = ""
     return {
         "t_s": round(t_s, S_DIGITS),
         "utc": _utc(run, record.host_ns),
@@ -420,12 +436,16 @@ def _motion(rows: FloatArray) -> dict[str, Any] | None:
     """
     if not len(rows):
         return None
-    turned_rad, at = rows[:, 6:9], rows[:, 1] - rows[:, 1].mean()
+    turned_rad = rows[:, 6:9]
+    at = rows[:, 1] - rows[:, 1].mean()
     angles, names = _angles(rows[:, 2:6], turned_rad)
     about = _curves(angles - angles.mean(axis=0), names)
     # A line is fitted to each turn over the attitude's time.
     spread = float((at * at).sum())
-    slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)
+    if spread > 0:
+        slope = (at @ turned_rad) / spread
+    else:
+        slope = np.zeros(3)
     beside = np.degrees(turned_rad - turned_rad.mean(axis=0) - at[:, None] * slope)
     return {
         "t_s": _numbers(rows[:, 0], S_DIGITS),

@@ -87,29 +87,37 @@ class RunStatus:
 
     def line(self) -> str:
         """The run in one line that is quickly read."""
-        shown, running = self._shown, self._running
+        shown = self._shown
+        running = self._running
         if shown is None or running is None:
             return "no frame yet"
-        attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
-        told = (
+        attitude = _attitude_line(shown)
+        tally = running.loop.tally
+        packets = running.packets
+        tally_text = (
             f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets,"
             f" {packets.refused} refused"
         )
-        wrong = "".join(f"{one.text}; " for one in running.loop.notices.wrong_sky.now())
-        return f"{wrong}attitude {attitude.text}; {told}" + (
+        wrong = "".join(f"{condition.text}; " for condition in running.loop.notices.wrong_sky.now())
+        return f"{wrong}attitude {attitude.text}; {tally_text}" + (
             "; shown by --force" if self._source.forced else ""
         )
 
     def lines(self, now_ns: int) -> list[StatusLine]:
         """The status at a host time; rates are since it was last asked for."""
-        shown, running = self._shown, self._running
+        shown = self._shown
+        running = self._running
         if shown is None or running is None:
             return [StatusLine("frames", "none yet"), *self._about()]
-        tally, packets = running.loop.tally, running.packets
+        tally = running.loop.tally
+        packets = running.packets
         then_ns, frames, received = self._before
         self._before = (now_ns, tally.frames, packets.received)
         seconds = max(now_ns - then_ns, 1) / NS_PER_S
-        total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
+        if math.isinf(self._source.frames):
+            total = ""
+        else:
+            total = f" of {self._source.frames:.0f}"
         text = (
             f"{tally.frames}{total} ({(tally.frames - frames) / seconds:.1f}/s),"
             f" {tally.missed_frames} missed"
@@ -125,7 +133,7 @@ class RunStatus:
         refused = ", ".join(
             f"{reason} {count}" for reason, count in packets.refused_by.items() if count
         )
-        told = (
+        packets_text = (
             f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s),"
             f" {packets.refused} refused"
         )
@@ -134,20 +142,26 @@ class RunStatus:
         )
         return [
             *(
-                StatusLine("sky", f"WRONG: {one.text}", False)
-                for one in running.loop.notices.wrong_sky.now()
+                StatusLine("sky", f"WRONG: {condition.text}", False)
+                for condition in running.loop.notices.wrong_sky.now()
             ),
             _attitude_line(shown),
             frames_line,
-            StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),
+            StatusLine("packets", packets_text + (f" ({refused})" if refused else ""), not refused),
             *([] if running.answers is None else [_tracker_line(running.answers.figures)]),
             *self._about(),
         ]
 
     def _about(self) -> Iterator[StatusLine]:
-        ledger = None if self._ledger is None else self._ledger.current
+        if self._ledger is None:
+            ledger = None
+        else:
+            ledger = self._ledger.current
         if ledger is not None:
-            failed = f"; failed: {ledger.failure}" if ledger.failure else ""
+            if ledger.failure:
+                failed = f"; failed: {ledger.failure}"
+            else:
+                failed = ""
             text = printable(f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}")
             yield StatusLine("ledger", text, ledger.failure is None)
         if self._source.forced:
@@ -176,10 +190,18 @@ def _attitude_line(shown: "Shown") -> StatusLine:
 
 def _tracker_line(found: "TrackerFigures") -> StatusLine:
     def three(values: list[float] | None) -> str:
-        return "-" if values is None else ", ".join(f"{value:.1f}" for value in values)
+        if values is None:
+            return "-"
+        return ", ".join(f"{value:.1f}" for value in values)
 
-    late = "-" if found.latency_ms is None else f"{found.latency_ms:.0f} ms"
-    share = "-" if found.availability is None else f"{100 * found.availability:.1f} %"
+    if found.latency_ms is None:
+        late = "-"
+    else:
+        late = f"{found.latency_ms:.0f} ms"
+    if found.availability is None:
+        share = "-"
+    else:
+        share = f"{100 * found.availability:.1f} %"
     text = (
         f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share}"
         f" available, {late} late"
@@ -220,8 +242,10 @@ def on_terminal(status: RunStatus) -> Iterator[None]:
 def _plain(status: RunStatus, stop: threading.Event) -> None:
     begun_s = time.monotonic()
     while not stop.wait(PLAIN_EACH_S):
-        said = "; ".join(f"{line.label} {line.text}" for line in status.lines(time.monotonic_ns()))
-        print(f"hilstar: {time.monotonic() - begun_s:.0f} s: {said}", file=sys.stderr)
+        lines_text = "; ".join(
+            f"{line.label} {line.text}" for line in status.lines(time.monotonic_ns())
+        )
+        print(f"hilstar: {time.monotonic() - begun_s:.0f} s: {lines_text}", file=sys.stderr)
 
 
 def _live(status: RunStatus, stop: threading.Event) -> None:
@@ -243,7 +267,10 @@ def _table(lines: list[StatusLine]) -> "Table":
 
     table = Table.grid(padding=(0, 2))
     for line in lines:
-        mark = Text("ok", style="green") if line.well else Text("!!", style="bold red")
+        if line.well:
+            mark = Text("ok", style="green")
+        else:
+            mark = Text("!!", style="bold red")
         table.add_row(
             mark, Text(line.label, style="bold"), Text(line.text, overflow="ellipsis", no_wrap=True)
         )

@@ -147,15 +147,17 @@ class Headers:
             match = HEADER.match(text)
             if match is None:
                 raise ScpiError(*_of_header(text))
-            name, query = match[1].upper(), match[2] or ""
-            if any(len(each) > MAX_MNEMONIC for each in name.lstrip("*:").split(":")):
+            name = match[1].upper()
+            query = match[2] or ""
+            if any(len(mnemonic) > MAX_MNEMONIC for mnemonic in name.lstrip("*:").split(":")):
                 raise ScpiError(-112, f"{name[:40]}; a keyword has at most {MAX_MNEMONIC} letters")
             if name.startswith("*"):
                 known = self._patterns.get(name + query)
             else:
                 nodes = (() if name.startswith(":") else path) + tuple(name.lstrip(":").split(":"))
                 name = ":".join(nodes)
-                known, path = self._patterns.get(name + query), nodes[:-1]
+                known = self._patterns.get(name + query)
+                path = nodes[:-1]
             if known is None:
                 raise ScpiError(-113, name[:80] + query)
             rest = text[match.end() :]
@@ -178,7 +180,8 @@ def _split(text: str, at: str) -> Iterator[str]:
     """The parts of a text between separators that stand in no string. Raises ScpiError (-151)
     where a string has no end.
     """
-    quote, begin = "", 0
+    quote = ""
+    begin = 0
     for k, c in enumerate(text):
         if quote:
             quote = "" if c == quote else quote
@@ -310,7 +313,8 @@ class Register:
 
     def read(self) -> int:
         """The events since it was read last, which reading clears."""
-        event, self.event = self.event, 0
+        event = self.event
+        self.event = 0
         return event
 
 
@@ -338,7 +342,9 @@ class InstrumentStatus:
 
     def next_error(self) -> str:
         """The oldest error, which leaves the queue."""
-        return self.errors.popleft() if self.errors else ScpiError(0).text
+        if self.errors:
+            return self.errors.popleft()
+        return ScpiError(0).text
 
     def clear(self) -> None:
         """`*CLS`: events and errors are gone, enables stay."""
@@ -352,11 +358,11 @@ class InstrumentStatus:
 
     def byte(self, message_waits: bool) -> int:
         """The status byte, as `*STB?` has it."""
-        found = ERRORS_WAIT * bool(self.errors) | MESSAGE_WAITS * message_waits
-        found |= STANDARD_EVENT * bool(self.standard.event & self.standard.enable)
-        found |= QUESTIONABLE * bool(self.questionable.event & self.questionable.enable)
-        found |= OPERATION * bool(self.operation.event & self.operation.enable)
-        return found | MASTER * bool(found & self.service_enable & ~MASTER)
+        status_byte = ERRORS_WAIT * bool(self.errors) | MESSAGE_WAITS * message_waits
+        status_byte |= STANDARD_EVENT * bool(self.standard.event & self.standard.enable)
+        status_byte |= QUESTIONABLE * bool(self.questionable.event & self.questionable.enable)
+        status_byte |= OPERATION * bool(self.operation.event & self.operation.enable)
+        return status_byte | MASTER * bool(status_byte & self.service_enable & ~MASTER)
 
 
 class NotScpi(Exception):
@@ -373,7 +379,8 @@ class LineBuffer:
     def __init__(self) -> None:
         self._bytes = bytearray()
         # of the line so far, also of one that is too long to be kept
-        self._head, self._end = b"", b""
+        self._head = b""
+        self._end = b""
         self._too_long = False
 
     def feed(self, data: bytes) -> Iterator[str | None]:
@@ -387,7 +394,8 @@ class LineBuffer:
                 raise NotScpi("the request line of HTTP")
             yield None if self._too_long else self._bytes.decode("latin-1").rstrip("\r")
             self._bytes.clear()
-            self._head, self._end = b"", b""
+            self._head = b""
+            self._end = b""
             self._too_long = False
         self._add(rest)
 

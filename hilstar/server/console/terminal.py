@@ -78,7 +78,9 @@ def report(summary: "RunSummary", as_json: bool) -> None:
     def spread(times: "Percentiles") -> str:
         return " / ".join(figure(value) for value in (times.p50, times.p99, times.max))
 
-    packets, stars, clipped = summary.packets, summary.stars_drawn, summary.clipped
+    packets = summary.packets
+    stars = summary.stars_drawn
+    clipped = summary.clipped
     refused = ", ".join(
         f"{reason} {count}" for reason, count in packets.refused_by.items() if count
     )
@@ -108,7 +110,10 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         # brings NumPy, which Tab and --help do not need
         from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 
-        absolute = "" if summary.clock.mode in KNOWN_MODES else " above the minimum"
+        if summary.clock.mode in KNOWN_MODES:
+            absolute = ""
+        else:
+            absolute = " above the minimum"
         if summary.receive_latency_ms:
             lines["receive latency"] = (
                 f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
@@ -145,11 +150,14 @@ def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "")
         advice = trouble.removeprefix(f"{endpoint}: ") or "start the sender, and check its address"
         return f"no attitude came from {endpoint}; {advice}"
     reasons = [(count, reason) for reason, count in packets.refused_by.items() if count]
-    shown = INSTEAD if packets.shown is UNSET else {**INSTEAD, **packets.shown}
-    told = "; ".join(
+    if packets.shown is UNSET:
+        shown = INSTEAD
+    else:
+        shown = {**INSTEAD, **packets.shown}
+    reasons_text = "; ".join(
         f"{count} for {reason}: {shown[reason]}" for count, reason in sorted(reasons, reverse=True)
     )
-    return f"all {packets.refused} packets from {endpoint} were refused, {told}"
+    return f"all {packets.refused} packets from {endpoint} were refused, {reasons_text}"
 
 
 def clock_line(clock: "ClockSummary") -> str:

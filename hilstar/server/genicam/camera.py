@@ -76,9 +76,9 @@ class GenicamCamera(Closing):
         self._folder = tempfile.TemporaryDirectory(prefix="hilstar-camera-")
         self._file = Path(self._folder.name) / "image"
         self._asked: tuple[float, float] | None = None  # an exposure, us, and until when, s
-        words = [str(SYSTEM_PYTHON), str(CHILD), "grab", name]
+        command = [str(SYSTEM_PYTHON), str(CHILD), "grab", name]
         self._child = subprocess.Popen(
-            words,
+            command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -177,7 +177,9 @@ class GenicamCamera(Closing):
         self._child.kill()
         _, err = self._child.communicate()
         lines = err.decode(errors="replace").strip().splitlines()
-        return shortened(lines[-1]) if lines else "it ended without a word"
+        if lines:
+            return shortened(lines[-1])
+        return "it ended without a word"
 
     def _check_time(self, end_s: float, what: str) -> None:
         if time.monotonic() > end_s:

@@ -23,7 +23,8 @@ def unpacked(data: bytes, pixel_format: str, width_px: int, height_px: int) -> D
             f"the camera sends {pixel_format}; write a pixel_format of grey or Bayer, such as"
             ' "Mono12"'
         )
-    bits, packing = int(match[2]), match[3]
+    bits = int(match[2])
+    packing = match[3]
     count = width_px * height_px
     if packing == "p":
         values = _from_bit_stream(data, bits, count)

@@ -127,9 +127,12 @@ class GigECamera(Closing):
         notices: Notices,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
-        self.settings, self.counts = settings, CameraCounts()
+        self.settings = settings
+        self.counts = CameraCounts()
         self.own_ns: Callable[[int], int] = int
-        self._allowed, self._notices, self._clock = allowed, notices, clock
+        self._allowed = allowed
+        self._notices = notices
+        self._clock = clock
         self._control_socket = _bound(identity.address, PORT)
         self._searches = _broadcasts(identity.address)
         self._stream_socket = _bound(identity.address, 0)
@@ -166,7 +169,9 @@ class GigECamera(Closing):
 
     def trigger_ns(self) -> int | None:
         """When the oldest trigger came that has begun no exposure yet, host time."""
-        return self._triggers_ns.popleft() if self._triggers_ns else None
+        if self._triggers_ns:
+            return self._triggers_ns.popleft()
+        return None
 
     def take(self, dn: npt.NDArray[np.uint16], begin_ns: int) -> None:
         """Send an image (height, width), DN, whose exposure began at `begin_ns`, host time;
@@ -283,7 +288,10 @@ class GigECamera(Closing):
         count = request.last - request.first + 1
         if destination is None or not self._again.take(self._clock.now_ns(), count):
             return
-        block = next((one for one in list(self._blocks) if one.number == request.block), None)
+        block = next(
+            (sent_block for sent_block in list(self._blocks) if sent_block.number == request.block),
+            None,
+        )
         if block is None:
             _send(self._stream_socket, [unavailable(request.block, request.first)], destination)
             return
@@ -365,10 +373,10 @@ def _broadcast_of(address: ipaddress.IPv4Address) -> str:
         for _, name in socket.if_nameindex():
             request = INTERFACE_REQUEST.pack(name.encode(), b"")
             with suppress(OSError):
-                own = fcntl.ioctl(asking, SIOCGIFADDR, request)
-                if own[ADDRESS_PLACE] == address.packed:
-                    told = fcntl.ioctl(asking, SIOCGIFBRDADDR, request)
-                    return str(ipaddress.IPv4Address(told[ADDRESS_PLACE]))
+                interface_reply = fcntl.ioctl(asking, SIOCGIFADDR, request)
+                if interface_reply[ADDRESS_PLACE] == address.packed:
+                    broadcast_reply = fcntl.ioctl(asking, SIOCGIFBRDADDR, request)
+                    return str(ipaddress.IPv4Address(broadcast_reply[ADDRESS_PLACE]))
     return str(address)
 
 

@@ -118,7 +118,8 @@ class ControlChannel:
 
     def take_events(self) -> list[ControlEvent]:
         """The events since they were last taken, oldest first."""
-        events, self._events = self._events, []
+        events = self._events
+        self._events = []
         return events
 
     @property
@@ -163,10 +164,12 @@ class ControlChannel:
             return self._last[3] if flags & ANSWER_WANTED else None
         self.counts.commands += 1
         try:
-            status, answer = GvcpStatus.SUCCESS, self._obeyed(command, body, peer, now_ns)
+            status = GvcpStatus.SUCCESS
+            answer = self._obeyed(command, body, peer, now_ns)
         except RegisterError as refusal:
             self.counts.refused += 1
-            status, answer = refusal.status, b""
+            status = refusal.status
+            answer = b""
         if command == ControlCommand.RESEND:
             return None
         head = ANSWER_HEADER.pack(status, (command + 1) & 0xFFFF, len(answer), number)
@@ -242,7 +245,8 @@ class ControlChannel:
             if self.controller == peer:
                 self._release(silent=False)
             return
-        self.controller, self._heard_ns = peer, now_ns
+        self.controller = peer
+        self._heard_ns = now_ns
         self.registers.put_word(PRIVILEGE, wanted)
 
     def _check_controller(self, peer: Peer) -> None:
@@ -260,5 +264,6 @@ class ControlChannel:
         if not self.is_client(peer) or len(body) != RESEND.size:
             return
         _, block, first, last = RESEND.unpack(body)
-        first, last = first & 0xFF_FFFF, last & 0xFF_FFFF
+        first = first & 0xFF_FFFF
+        last = last & 0xFF_FFFF
         self._events.append(Resend(block, first, min(last, first + MAX_RESENT - 1)))

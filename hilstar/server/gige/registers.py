@@ -212,10 +212,10 @@ class CameraSettings:
 
     def pixel_formats(self) -> list[str]:
         """The formats of this detector, its own first: DN as they are, or their upper 8 bits."""
-        own = [name for name, form in PIXEL_FORMATS.items() if form.bits == self.bits]
+        formats = [name for name, form in PIXEL_FORMATS.items() if form.bits == self.bits]
         wider = ["Mono16"] if self.bits < 16 else []
         upper = ["Mono8"] if self.bits > 8 else []
-        return [*own, *wider, *upper]
+        return [*formats, *wider, *upper]
 
     @property
     def payload_bytes(self) -> int:
@@ -251,7 +251,7 @@ class Registers:
 
     def _identify(self, identity: CameraIdentity) -> None:
         address = int(identity.address)
-        words = {
+        boot_words = {
             VERSION: VERSION_1_2,
             DEVICE_MODE: BIG_ENDIAN_UTF8,
             # a locally administered address (IEEE 802: bit 1 of the first byte) that holds the IP
@@ -269,7 +269,7 @@ class Registers:
             TICKS_LOW: TICKS_PER_S & 0xFFFF_FFFF,
             STREAM_PACKET_BYTES: DEFAULT_PACKET_BYTES,
         }
-        for at, value in words.items():
+        for at, value in boot_words.items():
             self.put_word(at, value)
         size = len(self._description)
         texts = {
@@ -282,8 +282,8 @@ class Registers:
         }
         for at, (text, room) in texts.items():
             # the last byte stays 0: a client reads up to it
-            kept = text.encode()[: room - 1].decode(errors="ignore").encode()
-            self._boot[at : at + len(kept)] = kept
+            text_bytes = text.encode()[: room - 1].decode(errors="ignore").encode()
+            self._boot[at : at + len(text_bytes)] = text_bytes
 
     def word(self, address: int) -> int:
         """A bootstrap register."""
@@ -305,8 +305,8 @@ class Registers:
             return bytes(self._boot[address : address + count])
         features_end = FEATURES_AT + WORD_BYTES * len(FEATURES)
         if address >= FEATURES_AT and address + count <= features_end:
-            words = range(address, address + count, WORD_BYTES)
-            return b"".join(self._feature_word(BY_ADDRESS[at]) for at in words)
+            word_places = range(address, address + count, WORD_BYTES)
+            return b"".join(self._feature_word(BY_ADDRESS[at]) for at in word_places)
         offset = address - DESCRIPTION_AT
         room = math.ceil(len(self._description) / WORD_BYTES) * WORD_BYTES
         if offset >= 0 and offset + count <= room:

@@ -46,7 +46,8 @@ def _packed_in_threes(values: npt.NDArray[np.uint16], bits: int) -> bytes:
         values = np.append(values, np.uint16(0))
     low_bits = bits - 8
     mask = (1 << low_bits) - 1
-    first, second = values[0::2], values[1::2]
+    first = values[0::2]
+    second = values[1::2]
     threes = np.empty((len(first), 3), np.uint8)
     threes[:, 0] = first >> low_bits
     threes[:, 1] = (first & mask) | (second & mask) << 4
@@ -77,9 +78,11 @@ class ImageBlock:
     def packet(self, number: int) -> list[bytes | memoryview]:
         """A packet's header and what follows it."""
         if number == 0:
-            kind, body = LEADER, self.leader
+            kind = LEADER
+            body = self.leader
         elif number == self.last:
-            kind, body = TRAILER, self.trailer
+            kind = TRAILER
+            body = self.trailer
         else:
             first = (number - 1) * self.data_bytes
             return [self._header(PAYLOAD, number), self.payload[first : first + self.data_bytes]]

@@ -102,13 +102,15 @@ class SpanTally:
 
     def mean(self) -> list[float] | None:
         """The mean error, arcsec; None without a right answer."""
-        return _rounded(self.total / self.counts["right"]) if self.counts["right"] else None
+        if self.counts["right"]:
+            return _rounded(self.total / self.counts["right"])
+        return None
 
     def rms(self) -> list[float] | None:
         """The rms about zero."""
-        return (
-            _rounded(np.sqrt(self.squares / self.counts["right"])) if self.counts["right"] else None
-        )
+        if self.counts["right"]:
+            return _rounded(np.sqrt(self.squares / self.counts["right"]))
+        return None
 
     def sigma3(self) -> list[float] | None:
         """Three standard deviations; None for fewer than two right answers."""
@@ -146,7 +148,8 @@ class _Fault:
     was_right: bool = False  # the last answer of the fault
 
     def add(self, record: AnswerRecord) -> None:
-        at_ns, around_ns = record.middle_ns, AROUND_S * NS_PER_S
+        at_ns = record.middle_ns
+        around_ns = AROUND_S * NS_PER_S
         if at_ns < self.start_ns:
             if at_ns >= self.start_ns - around_ns:
                 self.parts[0].add(record)
@@ -184,7 +187,10 @@ class _Fault:
             part.span(max(length_ns, 0) / NS_PER_S, cycle_s)
             for part, length_ns in zip(self.parts, lengths_ns, strict=True)
         )
-        recovered_s = None if self.recovered_ns is None else _s(self.recovered_ns, end_ns)
+        if self.recovered_ns is None:
+            recovered_s = None
+        else:
+            recovered_s = _s(self.recovered_ns, end_ns)
         return FaultEffect(
             name=self.record.name,
             kind=self.record.kind,
@@ -206,14 +212,16 @@ class AnswerTally:
     """
 
     def __init__(self, begun_ns: int = 0) -> None:
-        self.whole, self._begun_ns = SpanTally(), begun_ns
+        self.whole = SpanTally()
+        self._begun_ns = begun_ns
         self.wrong_ns: list[int] = []
         self.faults: list[_Fault] = []
         self._open: list[_Fault] = []
         self.replayed: dict[int, FaultRecord] = {}
         self._shown: frozenset[int] = frozenset()
         self._lately: deque[AnswerRecord] = deque()
-        self._interval_s, self._latency_ms = RunningStatistics(), RunningStatistics()
+        self._interval_s = RunningStatistics()
+        self._latency_ms = RunningStatistics()
         self._order = StampOrder()
         self._first_ns = self._last_ns = self._host_ns = 0
 
@@ -285,13 +293,14 @@ class AnswerTally:
         if not answers:
             return None
         cycle_s = self._interval_s.percentile(50)
-        due = (
-            0
-            if not cycle_s
-            else round((self._last_ns - self._first_ns) / NS_PER_S / cycle_s)
-            + 1
-            - counts["unpaired"]
-        )
+        if not cycle_s:
+            due = 0
+        else:
+            due = (
+                round((self._last_ns - self._first_ns) / NS_PER_S / cycle_s)
+                + 1
+                - counts["unpaired"]
+            )
         # the last answer stands for the time to the next
         end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)
         return AnswerReport(
@@ -323,9 +332,10 @@ def answer_rows(found: AnswerReport | None) -> list[tuple[str, str]]:
     if found.out_of_order:
         refused += f"; {found.out_of_order} came out of order"
     late = found.latency_ms
-    times = (
-        "" if late.p50 is None else f", {late.p50:.1f} / {late.p99 or 0:.1f} ms late (p50 / p99)"
-    )
+    if late.p50 is None:
+        times = ""
+    else:
+        times = f", {late.p50:.1f} / {late.p99 or 0:.1f} ms late (p50 / p99)"
     rows = [
         ("tracker's answers", f"{found.answers}: {refused}"),
         ("tracker's availability", f"{_share(found.availability)}{times}"),
@@ -335,24 +345,21 @@ def answer_rows(found: AnswerReport | None) -> list[tuple[str, str]]:
         ),
     ]
     for fault in found.faults:
-        parts = [
-            f"{name} {_share(span.availability)}, {_three(span.rms_arcsec)} arcsec"
-            for name, span in (
-                ("before", fault.before),
-                ("during", fault.during),
-                ("after", fault.after),
-            )
-        ]
-        wrong = (
-            "none wrong"
-            if fault.first_wrong_s is None
-            else f"first wrong after {fault.first_wrong_s:.2f} s"
-        )
-        again = (
-            "not recovered"
-            if fault.recovered_s is None
-            else f"recovered in {fault.recovered_s:.2f} s"
-        )
+        parts = []
+        for name, span in (
+            ("before", fault.before),
+            ("during", fault.during),
+            ("after", fault.after),
+        ):
+            parts.append(f"{name} {_share(span.availability)}, {_three(span.rms_arcsec)} arcsec")
+        if fault.first_wrong_s is None:
+            wrong = "none wrong"
+        else:
+            wrong = f"first wrong after {fault.first_wrong_s:.2f} s"
+        if fault.recovered_s is None:
+            again = "not recovered"
+        else:
+            again = f"recovered in {fault.recovered_s:.2f} s"
         rows.append((f"fault {fault.name}", "; ".join([*parts, wrong, again])))
     return rows
 
@@ -362,7 +369,9 @@ def _share(value: float | None) -> str:
 
 
 def _three(values: list[float] | None) -> str:
-    return "-" if values is None else " ".join(f"{value:.1f}" for value in values)
+    if values is None:
+        return "-"
+    return " ".join(f"{value:.1f}" for value in values)
 
 
 def _s(at_ns: int, zero_ns: int) -> float:

@@ -57,7 +57,9 @@ class Commanded:
         held_s: FloatArray = NO_SPANS,
         hold_s: FloatArray | None = None,
     ) -> None:
-        self.t_s, self.q, self.held_s = t_s, q, held_s
+        self.t_s = t_s
+        self.q = q
+        self.held_s = held_s
         self.hold_s = np.diff(held_s, axis=1)[:, 0] if hold_s is None else hold_s
         gap_s = np.diff(t_s)
         self.interval_s = float(np.median(gap_s)) if len(gap_s) else 0.0
@@ -66,7 +68,8 @@ class Commanded:
         near = gap_s <= max(MAX_GAP_S, USUAL_INTERVALS * self.interval_s)
         # A step is a jump where it is much faster than the one before and the one after it.
         rate = np.nan_to_num(turned) / gap_s
-        before, after = np.append(0.0, rate[:-1]), np.append(rate[1:], 0.0)
+        before = np.append(0.0, rate[:-1])
+        after = np.append(rate[1:], 0.0)
         jumps = (np.nan_to_num(turned) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after))
         with np.errstate(invalid="ignore"):
             self.joined = (
@@ -90,12 +93,15 @@ class Commanded:
         """
         before = np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, len(self.t_s) - 2)
         known = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & self.joined[before]
-        gap_s, step = self._gap_s[before, None], self._step[before]
+        gap_s = self._gap_s[before, None]
+        step = self._step[before]
         share = np.clip((t_s - self.t_s[before]) / gap_s[:, 0], 0, 1)[:, None]
         # Hermite's cubic of the rotation vector from the frame before; at its ends it turns by
         # (step + bend) per interval.
-        start, end = step + self._bend(before, -1), step + self._bend(before, 1)
-        squared, cubed = share**2, share**3
+        start = step + self._bend(before, -1)
+        end = step + self._bend(before, 1)
+        squared = share**2
+        cubed = share**3
         moved = (
             (cubed - 2 * squared + share) * start
             + (3 * squared - 2 * cubed) * step

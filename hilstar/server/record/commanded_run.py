@@ -38,7 +38,10 @@ def read_commanded(ledger: Path) -> CommandedRun:
     """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage,
     for under two frames.
     """
-    light, shown, changed, missed = array("q"), array("d"), 0, array("q")
+    light = array("q")
+    shown = array("d")
+    changed = 0
+    missed = array("q")
     for record in frame_records(ledger):
         plain = record.q is not None and not record.operator and not record.hidden
         changed += record.q is not None and not plain

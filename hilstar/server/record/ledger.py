@@ -126,7 +126,9 @@ class LedgerQueue:
     def take(self) -> list[QueueEntry]:
         """Take all entries."""
         with self._lock:
-            taken, self._entries, self._bytes = self._entries, [], 0
+            taken = self._entries
+            self._entries = []
+            self._bytes = 0
         return taken
 
 
@@ -154,18 +156,17 @@ class FloodFilter:
         with self._lock:
             allowance = self._allowances.get((kind, reason))
             if allowance is None:
-                rule = (
-                    "event"
-                    if kind == "event"
-                    else "accepted"
-                    if reason == "accepted"
-                    else "refused"
-                )
+                if kind == "event":
+                    rule = "event"
+                elif reason == "accepted":
+                    rule = "accepted"
+                else:
+                    rule = "refused"
                 allowance = self._allowances[kind, reason] = Allowance(*self.ALLOWED[rule])
-            kept = allowance.take(now_ns)
-            if not kept:
+            is_kept = allowance.take(now_ns)
+            if not is_kept:
                 self._counts[kind, reason] += 1
-        return kept
+        return is_kept
 
     def count(self, kind: Counted, reason: str, number: int = 1) -> None:
         """Count messages that are not recorded for other reasons."""
@@ -175,7 +176,8 @@ class FloodFilter:
     def counted(self) -> Counter[tuple[Counted, str]]:
         """The counts since the last call, by kind and reason."""
         with self._lock:
-            counts, self._counts = self._counts, Counter()
+            counts = self._counts
+            self._counts = Counter()
         return counts
 
 
@@ -237,7 +239,8 @@ class Ledger(Closing):
         self.path = self._asked = path
         self.failure: str | None = None
         self._notices = Notices() if notices is None else notices
-        self._overwrite, self._split = overwrite, split
+        self._overwrite = overwrite
+        self._split = split
         self._head = {
             "bench_sha256": bench.file.sha256,
             "bench_file": printable(str(bench.file.path)),
@@ -256,16 +259,20 @@ class Ledger(Closing):
             "unix_ns": str(time.time_ns()),
             "run_id": uuid.uuid4().hex,
         }
-        self._queue, self._filter = LedgerQueue(), FloodFilter()
+        self._queue = LedgerQueue()
+        self._filter = FloodFilter()
         self._lost = self._counted = self._part = 0
         self._thin = self._moved = False
-        self._renewed_s, self._rest_s = -math.inf, EACH_S
+        self._renewed_s = -math.inf
+        self._rest_s = EACH_S
         # records that a file begun during a run repeats
         self.standing: Callable[[], list[FaultRecord | EventRecord]] = list
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
-        self._each_s, self._probe, self._closing = 0.0, ProcessProbe(), threading.Event()
+        self._each_s = 0.0
+        self._probe = ProcessProbe()
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-ledger", daemon=True)
         self._thread.start()
 
@@ -298,17 +305,14 @@ class Ledger(Closing):
         """Record a packet; see `attitude.receiver.Watch`."""
         raw = raw[:MAX_RAW_BYTES]
         if sample is not None and refusal is None:
-            reason, sequence, encoded = (
-                "accepted",
-                sample.sequence,
-                partial(attitude_message, sample, host_ns, raw),
-            )
+            reason = "accepted"
+            sequence = sample.sequence
+            encoded = partial(attitude_message, sample, host_ns, raw)
         else:
-            refusal, sequence = (
-                refusal or Refusal("format", ""),
-                0 if sample is None else sample.sequence,
-            )
-            reason, detail = refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS]
+            refusal = refusal or Refusal("format", "")
+            sequence = 0 if sample is None else sample.sequence
+            reason = refusal.reason
+            detail = refusal.detail[:MAX_DETAIL_CHARACTERS]
             encoded = partial(refused_message, reason, detail, host_ns, raw)
         if self._filter.keeps("packet", reason, host_ns):
             self._queue.put(QueueEntry("packet", host_ns, sequence, encoded, len(raw)))
@@ -426,7 +430,9 @@ class Ledger(Closing):
         if self._renewed_s > 0:  # repeated damage must not fill the disk with files
             self._rest_s = min(2 * self._rest_s, MAX_REST_S)
         self._renewed_s = time.monotonic()
-        before, lost, part = part_path(self.path, self._part), self._writer.written, self._part
+        before = part_path(self.path, self._part)
+        lost = self._writer.written
+        part = self._part
         self.failure = f"{before} was {harm} while it was written"
         self._part = 0
         names = (
@@ -448,8 +454,12 @@ class Ledger(Closing):
         )
         self._lost += lost
         writer.take_over(self._writer)
-        old, self._file, self._writer, self.path = self._file, file, writer, path
-        self._begun_s, self._moved = time.monotonic(), False
+        old = self._file
+        self._file = file
+        self._writer = writer
+        self.path = path
+        self._begun_s = time.monotonic()
+        self._moved = False
         for record in self.standing():
             kind, number = (
                 ("fault", record.number) if isinstance(record, FaultRecord) else ("event", 0)
@@ -485,21 +495,24 @@ class Ledger(Closing):
 
     def _look_at_disk(self) -> None:
         disk = os.fstatvfs(self._file.fd)
-        free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
+        free = disk.f_bavail * disk.f_frsize
+        total = disk.f_blocks * disk.f_frsize
         if not total:
             return
-        left = f"{self.path}: {free / 1e6:.0f} MB, {free / total:.0%} of the disk, is free"
+        free_text = f"{self.path}: {free / 1e6:.0f} MB, {free / total:.0%} of the disk, is free"
         if free < LOW_SHARE * total:
-            self._notices.begin("disk-low", left)
+            self._notices.begin("disk-low", free_text)
         elif free > WELL_SHARE * total:
-            self._notices.end("disk-low", "disk-well", left)
+            self._notices.end("disk-low", "disk-well", free_text)
         self._thin = free < min(FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE * total)
         if self._thin:
             self._notices.begin(
-                "ledger-thin", f"{left}: frames are no longer recorded, packets still are"
+                "ledger-thin", f"{free_text}: frames are no longer recorded, packets still are"
             )
         else:
-            self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are recorded again")
+            self._notices.end(
+                "ledger-thin", "ledger-whole", f"{free_text}: frames are recorded again"
+            )
 
     def _flush(self) -> None:
         try:
@@ -540,7 +553,9 @@ class Ledger(Closing):
             self._writer.finish()
             self._file.close()
         finally:
-            self._file, self._writer, self._begun_s = file, writer, time.monotonic()
+            self._file = file
+            self._writer = writer
+            self._begun_s = time.monotonic()
 
     # The end
 
@@ -549,7 +564,10 @@ class Ledger(Closing):
         has failed.
         """
         self._closing.set()
-        patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
+        if caught() is None:
+            patience_s = DISK_WAITS_S
+        else:
+            patience_s = STOPPED_DISK_WAITS_S
         self._thread.join(patience_s)
         if self._thread.is_alive():  # it still owns the file, so nothing more can be done
             self._failed(
@@ -687,7 +705,8 @@ class LedgerSwitch:
         """End the ledger and wait until it is complete on the disk; the ended ledger."""
         # a signal that comes now does not interrupt this
         with self._ending, stop_on_signal(threading.Event()):
-            ledger, self.current = self.current, None
+            ledger = self.current
+            self.current = None
             if ledger is not None:
                 ledger.close()
         return ledger

@@ -131,10 +131,9 @@ def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
     `attitude.logs.mcap_log.ATTITUDE_SCHEMA`).
     """
     array = {"type": "array", "items": {"type": "number"}}
-    fields = {
-        f.name: {"type": _KINDS[f.type]} if f.type in _KINDS else array
-        for f in msgspec.structs.fields(record)
-    }
+    fields = {}
+    for f in msgspec.structs.fields(record):
+        fields[f.name] = {"type": _KINDS[f.type]} if f.type in _KINDS else array
     if "centroids" in fields:
         fields["centroids"] = {"type": "array", "items": {"type": "array"}}
     return msgspec.json.encode({"title": title, "type": "object", "properties": fields})
@@ -273,7 +272,8 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
     run's missed frames
     so far, and `below_step` the stars in view that are too faint for the monitor.
     """
-    attitude, drawn = shown.attitude, shown.drawn
+    attitude = shown.attitude
+    drawn = shown.drawn
     names = (
         "t_ns",
         "draw_ns",
@@ -297,15 +297,13 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
         **{name: getattr(shown, name) for name in names},
     )
     if shown.faults:
-        record.faults = tuple(one.number for one in shown.faults)
-        record.fault_since_ns = tuple(one.since_ns for one in shown.faults)
+        record.faults = tuple(active.number for active in shown.faults)
+        record.fault_since_ns = tuple(active.since_ns for active in shown.faults)
     record.rate = _numbers(drawn.rate_cam_rad_s)
     if attitude is not None:
         record.q = _numbers(attitude.q_icrs_to_cam)
-        record.velocity_km_s, record.place_km = (
-            _numbers(attitude.velocity_km_s),
-            _numbers(attitude.place_km),
-        )
+        record.velocity_km_s = _numbers(attitude.velocity_km_s)
+        record.place_km = _numbers(attitude.place_km)
         record.attitude_sequence = attitude.sequence
         record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
         record.receive_ns = attitude.received_ns
@@ -316,7 +314,8 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
 
 def answer_record(judged: Judged) -> AnswerRecord:
     """The ledger's record of an answer of the tracker."""
-    answer, lit = judged.answer, judged.lit
+    answer = judged.answer
+    lit = judged.lit
     record = AnswerRecord(
         host_ns=answer.host_ns,
         raw=answer.raw[:MAX_RAW_BYTES].hex(),
@@ -334,9 +333,11 @@ def answer_record(judged: Judged) -> AnswerRecord:
         middle_ns=_within_64_bits(judged.middle_ns),
     )
     if lit is not None:
-        record.light_ns, record.q_lit = _within_64_bits(lit.light_ns), _numbers(lit.q)
+        record.light_ns = _within_64_bits(lit.light_ns)
+        record.q_lit = _numbers(lit.q)
         record.residual_arcsec = _numbers(judged.residual)
-        record.first_frame, record.last_frame = lit.first, lit.last
+        record.first_frame = lit.first
+        record.last_frame = lit.last
     return record
 
 
@@ -346,7 +347,9 @@ def _numbers(values: FloatArray | None) -> Any:
 
 def below_step(bench: Bench, shown: Shown) -> int:
     """How many stars in view of a frame are too faint for the monitor."""
-    return 0 if shown.attitude is None else bench.count_faint(shown.attitude.q_icrs_to_cam)
+    if shown.attitude is None:
+        return 0
+    return bench.count_faint(shown.attitude.q_icrs_to_cam)
 
 
 def _within_64_bits(value_ns: int) -> int:
@@ -435,14 +438,10 @@ def run_blocks(path: Path, size: int) -> Iterator[list[RunRecord]]:
     try:
         for topics, messages in read_chunks(path):
             if topics is not last:
-                last, decode = (
-                    topics,
-                    {
-                        k: _DECODERS[topic].decode
-                        for k, topic in topics.items()
-                        if topic in _DECODERS
-                    },
-                )
+                last = topics
+                decode = {
+                    k: _DECODERS[topic].decode for k, topic in topics.items() if topic in _DECODERS
+                }
             block += [decode[channel](data) for channel, data in messages if channel in decode]
             while len(block) >= size:
                 yield _checked(block[:size])
@@ -477,7 +476,10 @@ def _first_fault(path: Path, error: Exception) -> InputError:
     for number, (topic, data) in enumerate(every, start=1):
         which = f"{number}, of {topic}"
         try:
-            record = _DECODERS[topic].decode(data) if topic in _DECODERS else None
+            if topic in _DECODERS:
+                record = _DECODERS[topic].decode(data)
+            else:
+                record = None
         except NOT_JSON as wrong:
             return _not_ours(path, f"{which},", wrong)
         if (
@@ -506,11 +508,10 @@ class PacketTally:
 
     def count(self, reason: str, number: int) -> None:
         """Add packets of one kind."""
-        key = (
-            reason[:MAX_REASON_CHARACTERS]
-            if len(self.counts) < MAX_REASONS or reason in self.counts
-            else "others"
-        )
+        if len(self.counts) < MAX_REASONS or reason in self.counts:
+            key = reason[:MAX_REASON_CHARACTERS]
+        else:
+            key = "others"
         self.counts[key] = self.counts.get(key, 0) + number
 
 
@@ -543,7 +544,10 @@ def raw_convention(config: BenchConfig) -> str:
     if settings.source not in PACKET_SOURCES:
         return "null"
     of_body = settings.convention.frame == "body"
-    mounting = config.tracker.q_body_to_cam if of_body else None
+    if of_body:
+        mounting = config.tracker.q_body_to_cam
+    else:
+        mounting = None
     meaning = {**msgspec.structs.asdict(settings.convention), "q_body_to_cam": mounting}
     return msgspec.json.encode(meaning).decode()
 

@@ -86,7 +86,9 @@ class ThinnedRows:
 
     def __init__(self, columns: int, capacity: int = SAMPLES, kind: type = float) -> None:
         self._rows: npt.NDArray[Any] = np.zeros((capacity, columns), dtype=kind)
-        self._kept, self._seen, self.stride = 0, 0, 1
+        self._kept = 0
+        self._seen = 0
+        self.stride = 1
 
     def add(self, rows: npt.NDArray[Any]) -> None:
         """Add rows (n, columns), or skip them."""
@@ -96,7 +98,8 @@ class ThinnedRows:
             self._rows[self._kept : self._kept + len(fitting)] = fitting
             self._kept += len(fitting)
             taken = min(len(rows), first + len(fitting) * self.stride)
-            self._seen, rows = self._seen + taken, rows[taken:]
+            self._seen = self._seen + taken
+            rows = rows[taken:]
             if len(rows) and self._kept == len(self._rows):
                 half = len(self._rows) // 2
                 self._rows[:half] = self._rows[::2]
@@ -123,11 +126,9 @@ class SpanTable:
 
     def __init__(self, columns: int, capacity: int = SPANS) -> None:
         shape = (capacity, columns)
-        self._low, self._high, self._sum = (
-            np.full(shape, np.inf),
-            np.full(shape, -np.inf),
-            np.zeros(shape),
-        )
+        self._low = np.full(shape, np.inf)
+        self._high = np.full(shape, -np.inf)
+        self._sum = np.zeros(shape)
         self._begin = np.zeros(capacity)
         self._used = self._in_last = 0
         self.length = 1
@@ -140,12 +141,12 @@ class SpanTable:
                     self._halve()
                     continue
                 self._begin[self._used] = rows[0, 0]
-                self._used, self._in_last = self._used + 1, 0
-            whole = (
-                0
-                if self._in_last
-                else min(len(rows) // self.length, len(self._begin) - self._used + 1)
-            )
+                self._used = self._used + 1
+                self._in_last = 0
+            if self._in_last:
+                whole = 0
+            else:
+                whole = min(len(rows) // self.length, len(self._begin) - self._used + 1)
             count = max(whole, 1) * self.length - self._in_last
             self._add(rows[:count], max(whole, 1))
             rows = rows[count:]
@@ -188,7 +189,8 @@ class TimeBins:
     def __init__(self, kinds: int, capacity: int = SPANS) -> None:
         self._counts = np.zeros((capacity, kinds), dtype=np.int64)
         self._first_ns: int | None = None
-        self._used, self.width_ns = 0, NS_PER_S
+        self._used = 0
+        self.width_ns = NS_PER_S
 
     def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
         """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first
@@ -319,7 +321,9 @@ class RunFigures:
     @property
     def duration_s(self) -> float:
         """From the first swap to the last."""
-        return 0.0 if self.last is None else (self.last.swap_ns - self.first_swap_ns) / NS_PER_S
+        if self.last is None:
+            return 0.0
+        return (self.last.swap_ns - self.first_swap_ns) / NS_PER_S
 
     @property
     def memory_growth_mb(self) -> float | None:
@@ -357,10 +361,10 @@ class RunFigures:
         if not self.wrong_sky.any:
             return
         newest = self._newest
-        found = _covered(self.wrong_sky, newest.swap_ns) & ~newest.wrong
-        newest.wrong |= found
-        self.counted["wrong_frames"] += int(found.sum())
-        self.counted["right_frames"] -= int((found & newest.plain).sum())
+        is_covered = _covered(self.wrong_sky, newest.swap_ns) & ~newest.wrong
+        newest.wrong |= is_covered
+        self.counted["wrong_frames"] += int(is_covered.sum())
+        self.counted["right_frames"] -= int((is_covered & newest.plain).sum())
 
     def _add_one(
         self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord
@@ -406,16 +410,17 @@ class RunFigures:
         )
 
     def _add_frames(self, frames: list[FrameRecord]) -> None:
-        before, self.last = self.last, frames[-1]
+        before = self.last
+        self.last = frames[-1]
         if before is None:
             self.first_swap_ns = frames[0].swap_ns
         self.counted["frames"] += len(frames)
         stale, capped, missed, stars, clipped, below = (_whole(frames, name)[0] for name in NUMBERS)
         blank = np.array([frame.q is None for frame in frames])
-        words = [np.array([getattr(frame, name) != "" for frame in frames]) for name in WORDS]
+        text_flags = [np.array([getattr(frame, name) != "" for frame in frames]) for name in WORDS]
         swap_ns, _ = _whole(frames, "swap_ns")
         wrong = _covered(self.wrong_sky, swap_ns)
-        masks = dict(zip(FAULTS, (stale > 0, blank, *words, wrong), strict=True))
+        masks = dict(zip(FAULTS, (stale > 0, blank, *text_flags, wrong), strict=True))
         self._newest.add(swap_ns, ~np.any([*masks.values()][:-1], axis=0), wrong)
         masks |= {
             "right_frames": ~np.any([*masks.values()], axis=0),
@@ -436,18 +441,22 @@ class RunFigures:
             frames,
             {"first stale": masks["late"], "most clipped stars": clipped, "most stars": stars},
         )
-        seen = np.flatnonzero(~blank)
-        if not len(seen):
+        shown_rows = np.flatnonzero(~blank)
+        if not len(shown_rows):
             return
-        q, t_ns = attitudes_of(frames), _whole(frames, "t_ns")[0][seen]
+        q = attitudes_of(frames)
+        t_ns = _whole(frames, "t_ns")[0][shown_rows]
         self._first_t_ns = int(t_ns[0]) if self._first_t_ns is None else self._first_t_ns
         last_q = q[0] if self._q is None else self._q
         turned = np.cumsum(
             np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0
         )
-        self._q, self._turned = q[-1], turned[-1]
+        self._q = q[-1]
+        self._turned = turned[-1]
         self.path.add(
-            np.column_stack([run_s[seen], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]])
+            np.column_stack(
+                [run_s[shown_rows], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]]
+            )
         )
 
 
@@ -477,7 +486,8 @@ def _times_ms(
 
 def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int64], BoolArray]:
     """A whole number of each record, 0 for None, and whether it is known, (n,) each."""
-    count, known = len(records), np.ones(len(records), dtype=bool)
+    count = len(records)
+    known = np.ones(len(records), dtype=bool)
     try:
         return np.fromiter(map(attrgetter(name), records), np.int64, count), known
     except TypeError:
@@ -568,17 +578,21 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def summarise(run: RunFigures) -> RunReport:
     """The figures of a run, from those of its frames."""
-    config, last = config_of(run.head), run.last
-    refresh_hz = None if config is None else config.monitor.refresh_hz
+    config = config_of(run.head)
+    last = run.last
+    if config is None:
+        refresh_hz = None
+    else:
+        refresh_hz = config.monitor.refresh_hz
     times = {key: run.spreads[name].percentiles() for name, key in METRICS.items()}
-    found: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {
+    figures: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {
         name: run.head.get(name) for name in HEAD
     }
-    found |= {
+    figures |= {
         name: getattr(run, name) for name in ("duration_s", "events", "pulses", "memory_growth_mb")
     }
     return RunReport(
-        **(found | times | run.most),
+        **(figures | times | run.most),
         missed_frames=0 if last is None else last.missed,
         timestamp_source="" if last is None else last.timestamp_source,
         refresh_hz=refresh_hz,

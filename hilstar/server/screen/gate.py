@@ -81,8 +81,8 @@ def open_screen(
     `today`.
     """
     monitor = file.config.monitor
-    found = check_monitor(file, identity_here(monitor.display), today)
-    found.refuse(force)
+    monitor_check = check_monitor(file, identity_here(monitor.display), today)
+    monitor_check.refuse(force)
     display = None if windowed else monitor.display
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
     sleep_in_waits()
@@ -91,7 +91,7 @@ def open_screen(
         fault = size_fault(window, monitor)
         if fault and not force:  # said before anything is drawn on it
             raise MachineError(f"{fault}; or add --force")
-        with _bench_on(window, file, found, timed=timed, force=force) as screen:
+        with _bench_on(window, file, monitor_check, timed=timed, force=force) as screen:
             yield screen
 
 
@@ -101,7 +101,8 @@ def _bench_on(
 ) -> Iterator[Screen]:
     """The bench of a file in a window, past the gate."""
     with open_bench(file, window_context(), timed=timed, on_screen=True) as bench:
-        wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
+        wanted = file.config.render.gpu
+        draws = bench.renderer.gl_renderer
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning(
                 "[render] gpu = %r is for headless frames; %s draws this window", wanted, draws
@@ -121,7 +122,8 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     """Time GATE_FRAMES swaps, refuse (MachineError) a display that is not the bench file's
     unless `force`; its timing.
     """
-    window, monitor = screen.window, screen.bench.config.monitor
+    window = screen.window
+    monitor = screen.bench.config.monitor
     screen.bench.draw(None)
     swaps_ns = []
     for number in range(GATE_FRAMES + 1):
@@ -261,13 +263,15 @@ def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timi
     # A display whose swaps come faster than any refresh does not wait for one: nothing keeps time
     # but this program.
     on_time = abs(period_ms / wanted_ms - 1) < REFRESH_TOLERANCE
-    by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED) if known_hz else on_time
+    if known_hz:
+        by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED)
+    else:
+        by_screen = on_time
     dropped = periods_ms > DROPPED * wanted_ms
-    error_ms = (
-        ERROR_OF_MEDIAN * float(np.std(periods_ms[~dropped])) / len(periods_ms) ** 0.5
-        if not dropped.all()
-        else 0.0
-    )
+    if not dropped.all():
+        error_ms = ERROR_OF_MEDIAN * float(np.std(periods_ms[~dropped])) / len(periods_ms) ** 0.5
+    else:
+        error_ms = 0.0
     return Timing(
         period_ms,
         int(dropped.sum()),
@@ -324,7 +328,8 @@ def _desktop_faults(window: Window) -> Iterator[str]:
 
 
 def _depth_faults(window: Window, monitor: Monitor) -> Iterator[str]:
-    buffer, wanted = window.back_buffer, monitor.bits
+    buffer = window.back_buffer
+    wanted = monitor.bits
     if buffer.bits != wanted:
         depths = f"{buffer.bits} bits per colour and the bench file says {wanted}"
         yield f"the window has {depths}; set [monitor] bits, or the depth of the X screen"

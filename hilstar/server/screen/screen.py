@@ -38,7 +38,8 @@ def maximal_sequence() -> tuple[int, ...]:
     """The 127 bits of the shift register x^7 + x^6 + 1: any 7 in a row come once (Golomb, Shift
     Register Sequences, 1967).
     """
-    state, bits = 1, []
+    state = 1
+    bits = []
     for _ in range(2**CODE_BITS - 1):
         bits.append(state & 1)
         state = state >> 1 | ((state ^ state >> 1) & 1) << CODE_BITS - 1
@@ -54,7 +55,9 @@ def marker_light(number: int, kind: str) -> int:
 
     `toggle` gives a latency modulo two frames, `code` modulo 127 frames.
     """
-    return number % 2 if kind == "toggle" else CODE[number % len(CODE)]
+    if kind == "toggle":
+        return number % 2
+    return CODE[number % len(CODE)]
 
 
 class SwapClock:
@@ -71,7 +74,8 @@ class SwapClock:
     PERIOD_SHARE = 0.004
 
     def __init__(self, first_ns: int, period_ns: float, paced_by_screen: bool) -> None:
-        self.period_ns, self.paced_by_screen = period_ns, paced_by_screen
+        self.period_ns = period_ns
+        self.paced_by_screen = paced_by_screen
         self._phase_ns = float(first_ns)
 
     def update(self, swap_ns: int) -> None:
@@ -190,9 +194,10 @@ class Screen:
         """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen
         keeps time.
         """
-        period_ns = (
-            period_ms * NS_PER_MS if by_screen else NS_PER_S / self.bench.config.monitor.refresh_hz
-        )
+        if by_screen:
+            period_ns = period_ms * NS_PER_MS
+        else:
+            period_ns = NS_PER_S / self.bench.config.monitor.refresh_hz
         self.clock = SwapClock(swap_ns, period_ns, by_screen)
         self.budget = DrawBudget(period_ns)
         self.queued = 0
@@ -224,7 +229,10 @@ class Screen:
         monitor = self.bench.config.monitor
         white = 2**monitor.bits - 1
         side_px = monitor.photodiode_px
-        marker = marker_light(number, monitor.photodiode) if side_px else None
+        if side_px:
+            marker = marker_light(number, monitor.photodiode)
+        else:
+            marker = None
         self._backend.present(
             self.aids.overlay,
             round(self.aids.patch_share * white),
@@ -265,12 +273,18 @@ class DisplayPacer(Pacer):
     ) -> None:
         operator = Operator(screen.aids, notices, lambda: screen.window.hidden, requests)
         super().__init__(screen.clock.period_ns, clock, operator)
-        self.scheduling, self._screen, self._notices = "normal", screen, notices
-        self._gamma_frames, self._gamma_ns, self._last_swap_ns = 0, 0, 0
+        self.scheduling = "normal"
+        self._screen = screen
+        self._notices = notices
+        self._gamma_frames = 0
+        self._gamma_ns = 0
+        self._last_swap_ns = 0
 
     def moments(self) -> Iterator[Moment]:
         """One for each swap that can still be reached."""
-        swaps, budget, slot = self._screen.clock, self._screen.budget, 0
+        swaps = self._screen.clock
+        budget = self._screen.budget
+        slot = 0
         due_ns = swaps.next_after(self.clock.now_ns() + budget.ns)
         while True:
             begin_ns = round(due_ns - budget.ns)
@@ -304,7 +318,8 @@ class DisplayPacer(Pacer):
         """Put the frame on the screen at its moment."""
         enter("present")
         marker = self._screen.present(number)
-        ready_ns, budget = self.clock.now_ns(), self._screen.budget
+        ready_ns = self.clock.now_ns()
+        budget = self._screen.budget
         budget.add(ready_ns - begun_ns)
         if moment.swap_ns is not None and not self._screen.clock.paced_by_screen:
             self.clock.wait_until(moment.swap_ns, self.stop)

@@ -104,16 +104,18 @@ class Disc:
     @property
     def air_radii(self) -> float:
         """The air's scale height in equatorial radii, 0 without air."""
-        return 0.0 if self.air is None else self.air.scale_km / self.equator_km
+        if self.air is None:
+            return 0.0
+        return self.air.scale_km / self.equator_km
 
     @property
     def slant_depth(self) -> float:
         """The optical depth along a ray that touches the surface, 0 without air (Chapman's
         limit).
         """
-        return (
-            0.0 if self.air is None else self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
-        )
+        if self.air is None:
+            return 0.0
+        return self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
 
     def limb(self, count: int, radii: float = 1.0) -> FloatArray:
         """Unit directions (count, 3), ICRS, of rays that pass the centre at `radii` of it, all
@@ -124,8 +126,8 @@ class Disc:
         ring = np.stack(
             [sine * np.cos(turn), sine * np.sin(turn), np.full(count, np.sqrt(1 - sine**2))], axis=1
         )
-        seen = ring @ np.linalg.inv(self.to_sphere).T
-        return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+        on_sphere = ring @ np.linalg.inv(self.to_sphere).T
+        return np.asarray(on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True))
 
     def of_rate(self, electrons_per_s: float) -> "Disc":
         """The same disc with this flux in all; black where nothing of it is lit."""
@@ -160,16 +162,16 @@ class Disc:
         beside it.
         """
         rays = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        seen = rays @ self.to_sphere.T
-        on = np.flatnonzero(self._impact(seen) < 1)
-        ray = seen[on] / np.linalg.norm(seen[on], axis=1, keepdims=True)
+        sphere_rays = rays @ self.to_sphere.T
+        on = np.flatnonzero(self._impact(sphere_rays) < 1)
+        ray = sphere_rays[on] / np.linalg.norm(sphere_rays[on], axis=1, keepdims=True)
         squared = ray[:, 0] ** 2 + ray[:, 1] ** 2
         closest = self.distance_radii * np.column_stack((ray[:, :2] * ray[:, 2:], -squared))
         place = (
             closest - np.sqrt(np.maximum(0.0, 1 - self.distance_radii**2 * squared))[:, None] * ray
         )
         light = np.zeros(len(directions))
-        light[on] = self.normal_e_per_s_sr * self._shaded(place, seen[on])
+        light[on] = self.normal_e_per_s_sr * self._shaded(place, sphere_rays[on])
         return light
 
     def with_air(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -201,9 +203,12 @@ class Disc:
 
         The rays have the sides of ICRS directions (n, 3).
         """
-        seen = directions @ self.to_sphere.T
+        sphere_directions = directions @ self.to_sphere.T
         # any at the middle
-        side = seen[:, :2] / np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-30)[:, None]
+        side = (
+            sphere_directions[:, :2]
+            / np.maximum(np.hypot(sphere_directions[:, 0], sphere_directions[:, 1]), 1e-30)[:, None]
+        )
         sine = 1 / self.distance_radii
         up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
         mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
@@ -239,11 +244,11 @@ class Disc:
         place, area = self._lit_face(nodes)
         # From the sphere's axes to space; the distance of each place along its ray.
         back = np.linalg.inv(self.to_sphere)
-        seen = place + np.array([0.0, 0.0, self.distance_radii])
-        true = seen @ back.T
+        from_observer = place + np.array([0.0, 0.0, self.distance_radii])
+        true = from_observer @ back.T
         distance = np.linalg.norm(true, axis=1)
-        shaded = self._shaded(place, seen / distance[:, None])
-        facing = -np.einsum("ij,ij->i", place, seen) * abs(np.linalg.det(back))
+        shaded = self._shaded(place, from_observer / distance[:, None])
+        facing = -np.einsum("ij,ij->i", place, from_observer) * abs(np.linalg.det(back))
         return true / distance[:, None], shaded * facing * area / distance**3
 
     def _lit_face(self, nodes: int) -> tuple[FloatArray, FloatArray]:
@@ -256,10 +261,8 @@ class Disc:
         node, weight = gauss_legendre(nodes)
         top = np.arccos(1 / self.distance_radii)
         # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
-        latitude, stretch = (
-            top * np.sin(node * np.pi / 2),
-            top * np.cos(node * np.pi / 2) * np.pi / 2,
-        )
+        latitude = top * np.sin(node * np.pi / 2)
+        stretch = top * np.cos(node * np.pi / 2) * np.pi / 2
         reach = np.arccos(np.minimum(1.0, 1 / (self.distance_radii * np.cos(latitude))))
         first = -reach
         if self.law in ("lambert", "lunar-lambert"):
@@ -269,10 +272,8 @@ class Disc:
         half = (reach - first) / 2
         longitude = first[:, None] + half[:, None] * (node + 1)
         area = (weight * stretch * np.cos(latitude) * half)[:, None] * weight
-        cosine, sine = (
-            np.cos(latitude)[:, None],
-            np.broadcast_to(np.sin(latitude)[:, None], longitude.shape),
-        )
+        cosine = np.cos(latitude)[:, None]
+        sine = np.broadcast_to(np.sin(latitude)[:, None], longitude.shape)
         place = np.stack([cosine * np.sin(longitude), sine, -cosine * np.cos(longitude)], axis=-1)
         return place.reshape(-1, 3), area.ravel()
 

@@ -68,7 +68,8 @@ def tdb_of_utc(utc_ns: int) -> Tdb:
     (ERFA's `dat` and `dtdb`).
     """
     days, rest_ns = divmod(utc_ns, NS_PER_DAY)
-    whole, part = UNIX_JD + days, rest_ns / NS_PER_DAY
+    whole = UNIX_JD + days
+    part = rest_ns / NS_PER_DAY
     with warnings.catch_warnings():
         # before 1960, and years after the last known leap second
         warnings.simplefilter("ignore", erfa.ErfaWarning)
@@ -83,14 +84,18 @@ class Kernel:
     """
 
     def __init__(self) -> None:
-        found = importlib.util.find_spec("skyfield_data")
-        if found is None or found.origin is None or importlib.util.find_spec("jplephem") is None:
+        package_spec = importlib.util.find_spec("skyfield_data")
+        if (
+            package_spec is None
+            or package_spec.origin is None
+            or importlib.util.find_spec("jplephem") is None
+        ):
             raise MachineError(
                 f"[sky.bodies] and [spacecraft] need an ephemeris of the Solar System; {INSTALL}"
             )
         from jplephem.spk import SPK
 
-        spk = SPK.open(str(Path(found.origin).parent / "data" / "de421.bsp"))
+        spk = SPK.open(str(Path(package_spec.origin).parent / "data" / "de421.bsp"))
         self._segments: dict[tuple[int, int], Any] = {
             link: spk[link] for chain in (EARTH, *CHAINS.values()) for link in chain
         }
@@ -99,7 +104,8 @@ class Kernel:
             segment.compute(segment.start_jd)
         spk.daf.file.close()
         sun = self._segments[CHAINS["Sun"][0]]
-        self.first_jd, self.last_jd = float(sun.start_jd), float(sun.end_jd)
+        self.first_jd = float(sun.start_jd)
+        self.last_jd = float(sun.end_jd)
 
     def places_km(
         self, chain: tuple[tuple[int, int], ...], whole: float, part: FloatArray
@@ -120,9 +126,9 @@ class Kernel:
         """
         light_days = np.zeros_like(part)
         for _ in range(LIGHT_TIME_ROUNDS):
-            seen = self.places_km(CHAINS[name], whole, part - light_days) - earth_km
-            light_days = np.linalg.norm(seen, axis=1) / LIGHT_KM_S / DAY_S
-        return seen
+            from_earth_km = self.places_km(CHAINS[name], whole, part - light_days) - earth_km
+            light_days = np.linalg.norm(from_earth_km, axis=1) / LIGHT_KM_S / DAY_S
+        return from_earth_km
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,13 +144,12 @@ class MovingSky:
         unix: bool = False,
     ) -> None:
         self.names = names = bodies.names
-        self._kernel, self._orbit, self._utc_ns, self._start_ns = (
-            kernel,
-            orbit,
-            utc_ns + start_ns,
-            start_ns,
-        )
-        self._bodies, self._unix = bodies, unix
+        self._kernel = kernel
+        self._orbit = orbit
+        self._utc_ns = utc_ns + start_ns
+        self._start_ns = start_ns
+        self._bodies = bodies
+        self._unix = unix
         self._epoch = tdb_of_utc(self._utc_ns)
         self._tracked = ("Sun", *(name for name in names if name != "Sun"))
         self._drawn = [self._tracked.index(name) for name in names]
@@ -220,12 +219,12 @@ class MovingSky:
             stars.vectors[-count:] = vectors
             stars.grid.centre[-count:] = vectors
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
-        seen = stars.seen_at(velocity)
+        apparent = stars.seen_at(velocity)
         if self.air is None:
-            return seen
+            return apparent
         utc_ns = self._utc_ns + moment.since_ns
         self.air.check_sun(self._circumstances(moment.since_ns // MINUTE_NS).sun_km, utc_ns)
-        return self.air.over(seen, utc_ns)
+        return self.air.over(apparent, utc_ns)
 
     def utc_ns(self, t_ns: int | None) -> int:
         """The UTC of a moment (None: the start), ns since 1970, held within the ephemeris."""
@@ -240,24 +239,26 @@ class MovingSky:
         if self.satellites is None:
             return None
         since_ns = self._within(t_ns)
-        now, utc_ns = partial(self._circumstances, since_ns // MINUTE_NS), self._utc_ns + since_ns
-        found = self.satellites.near(
+        now = partial(self._circumstances, since_ns // MINUTE_NS)
+        utc_ns = self._utc_ns + since_ns
+        satellite_pass = self.satellites.near(
             cone, SkyAt(utc_ns, now, self._fixed_km_s, *velocity_and_place)
         )
-        return found if found is None or self.air is None else found.through(self.air, utc_ns)
+        if satellite_pass is None or self.air is None:
+            return satellite_pass
+        return satellite_pass.through(self.air, utc_ns)
 
     def satellites_placed(self, t_ns: int | None) -> int:
         """How many of the satellites have a place by their elements at a moment."""
-        return (
-            0
-            if self.satellites is None
-            else self.satellites.place(self._utc_ns + self._within(t_ns))
-        )
+        if self.satellites is None:
+            return 0
+        return self.satellites.place(self._utc_ns + self._within(t_ns))
 
     def _compute_circumstances(self, minute: int) -> Circumstances:
         """The Sun and the Earth's velocity at a minute: 2.5 arcsec of the Sun, 0.4 m/s."""
         since_ns = minute * MINUTE_NS
-        cubics, share = self._span(since_ns // SPAN_NS), since_ns % SPAN_NS / SPAN_NS
+        cubics = self._span(since_ns // SPAN_NS)
+        share = since_ns % SPAN_NS / SPAN_NS
         powers = share**EXPONENTS
         return Circumstances(np.tensordot(powers, cubics.seen_km, 1)[0], powers @ cubics.earth_km_s)
 
@@ -285,16 +286,19 @@ class MovingSky:
         near &= 2 * radius_rad > wider_than_rad
         if not near.any():
             return []
-        directions, velocity = now[:-1, :3].copy(), _against_start(now, velocity_km_s)
-        others = near if self._earth is None else near & (np.arange(len(near)) != self._earth)
+        directions = now[:-1, :3].copy()
+        velocity = _against_start(now, velocity_km_s)
+        if self._earth is None:
+            others = near
+        else:
+            others = near & (np.arange(len(near)) != self._earth)
         if velocity is not None:
             directions[others] = aberrate(directions[others], velocity)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         step = self._step(moment)
-        found = [
-            _moved(self._face(step, i), directions[i], float(now[i, 3]))
-            for i in np.flatnonzero(near).tolist()
-        ]
+        found = []
+        for i in np.flatnonzero(near).tolist():
+            found.append(_moved(self._face(step, i), directions[i], float(now[i, 3])))
         if self.air is not None:
             found = _through(self.air, found, self._utc_ns + moment.since_ns)
         return sorted(found, key=lambda disc: disc.distance_km)
@@ -325,11 +329,9 @@ class MovingSky:
         """The last step of the orbit; where the observer's state comes with the frame, the
         moment itself.
         """
-        return (
-            SkyMoment(moment.since_ns // self._step_ns * self._step_ns)
-            if moment.state is None
-            else moment
-        )
+        if moment.state is None:
+            return SkyMoment(moment.since_ns // self._step_ns * self._step_ns)
+        return moment
 
     def _at(self, moment: SkyMoment) -> FloatArray:
         """A node's rows (see `_compute_node`) at any moment."""
@@ -347,11 +349,11 @@ class MovingSky:
         return self._sight(SkyMoment(since_ns))
 
     def _sight(self, moment: SkyMoment) -> Sight:
-        seen = self._seen_from(moment)
+        sight = self._seen_from(moment)
         return replace(
-            seen,
+            sight,
             directions=apparent_bodies(
-                seen.seen_km, replace(seen.view, velocity_km_s=self._fixed_km_s)
+                sight.seen_km, replace(sight.view, velocity_km_s=self._fixed_km_s)
             ),
         )
 
@@ -360,18 +362,15 @@ class MovingSky:
         span, rest_ns = divmod(moment.since_ns, SPAN_NS)
         cubics = self._span(span)
         share = rest_ns / SPAN_NS
-        powers, slopes = (
-            share**EXPONENTS,
-            EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S,
-        )
+        powers = share**EXPONENTS
+        slopes = EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S
         place_km, about_km_s = self._orbit.state(self._utc_ns + moment.since_ns)
-        from_earth_km, earth_km_s = (
-            np.tensordot(powers, cubics.seen_km, 1),
-            powers @ cubics.earth_km_s,
-        )
+        from_earth_km = np.tensordot(powers, cubics.seen_km, 1)
+        earth_km_s = powers @ cubics.earth_km_s
         velocity_km_s = earth_km_s + about_km_s
         if moment.state is not None:
-            place_km, about_km_s = np.array(moment.state[:3]), np.array(moment.state[3:])
+            place_km = np.array(moment.state[:3])
+            about_km_s = np.array(moment.state[3:])
         seen_km = from_earth_km - place_km
         # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a
         # low orbit, 700 m of the Moon
@@ -395,11 +394,10 @@ class MovingSky:
         }
 
     def _compute_span(self, span: int) -> Span:
-        date = (
-            tdb_of_utc(self._utc_ns + span * SPAN_NS)
-            if self._unix
-            else self._epoch.after(span * SPAN_S)
-        )
+        if self._unix:
+            date = tdb_of_utc(self._utc_ns + span * SPAN_NS)
+        else:
+            date = self._epoch.after(span * SPAN_S)
         part = date.part + CUBIC_AT * SPAN_S / DAY_S
         earth_km, earth_km_s = self._kernel.earth(date.whole, part)
         seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
@@ -429,12 +427,18 @@ class MovingSky:
 
     def _compute_face(self, moment: SkyMoment, i: int) -> Disc:
         """The disc of a drawn body, with its light."""
-        sight, name, rate = self._sight(moment), self.names[i], float(self._light(moment)[1][i])
+        sight = self._sight(moment)
+        name = self.names[i]
+        rate = float(self._light(moment)[1][i])
         if name == EARTH:
             return self._earth_disc(sight)
         row = self._drawn[i]
-        seen_km, sun_km = sight.seen_km[row], sight.seen_km[0] - sight.seen_km[row]
-        phase_deg = 0.0 if name == "Sun" else phase_angle_deg(-sun_km, seen_km)
+        seen_km = sight.seen_km[row]
+        sun_km = sight.seen_km[0] - sight.seen_km[row]
+        if name == "Sun":
+            phase_deg = 0.0
+        else:
+            phase_deg = phase_angle_deg(-sun_km, seen_km)
         disc = Disc(
             name=name,
             direction=sight.directions[row],
@@ -454,7 +458,8 @@ class MovingSky:
         return earth_disc(-sight.place_km, from_sun_km, sight.about_earth_km_s, v0_e_per_s)
 
     def _compute_light(self, moment: SkyMoment) -> tuple[FloatArray, FloatArray]:
-        sight, jyear = self._sight(moment), self._jyear(moment.since_ns / NS_PER_S)
+        sight = self._sight(moment)
+        jyear = self._jyear(moment.since_ns / NS_PER_S)
         from_sun_km = sight.seen_km + sight.view.from_sun_km
         v_mag = np.array(
             [
@@ -482,7 +487,8 @@ class MovingSky:
         """The first and the last time since the start in the ephemeris. Raises InputError where
         the start is beyond it.
         """
-        first, last = self._kernel.first_jd + EDGE_DAYS, self._kernel.last_jd - EDGE_DAYS
+        first = self._kernel.first_jd + EDGE_DAYS
+        last = self._kernel.last_jd - EDGE_DAYS
         limits = tuple(
             round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S)
             for jd in (first, last)
@@ -522,24 +528,27 @@ def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatAr
     change = now[-1, :3]
     if velocity_km_s is not None:
         return np.asarray(change + velocity_km_s)
-    return None if change @ change < UNSEEN_KM_S**2 else change
+    if change @ change < UNSEEN_KM_S**2:
+        return None
+    return change
 
 
 def _through(air: SiteAir, discs: list[Disc], utc_ns: int) -> list[Disc]:
     """Discs as the air shows them, those below the horizon left out; how it flattens them is
     left out too.
     """
-    above, seen = air.above(utc_ns), []
+    above = air.above(utc_ns)
+    above_horizon = []
     for disc in discs:
         altitude_rad = above.altitude_rad(disc.direction[None])
         if altitude_rad[0] > -disc.radius_rad:
             light = disc.normal_e_per_s_sr * float(air.shares(np.array([-1]), altitude_rad).mean())
-            seen.append(
+            above_horizon.append(
                 replace(
                     disc, direction=above.bent(disc.direction[None])[0], normal_e_per_s_sr=light
                 )
             )
-    return seen
+    return above_horizon
 
 
 def _moved(face: Disc, direction: FloatArray, distance_km: float) -> Disc:

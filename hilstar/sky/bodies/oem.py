@@ -61,8 +61,11 @@ class OemOrbit:
     step_s = 2.0  # as for a `TleOrbit`
 
     def __init__(self, text: str, name: str, utc_ns: int, day: bool = False) -> None:
-        self._name, self._segments, self._told = name, list(_segments(text, name)), False
-        self._stars_ns, self._unseen_ns = utc_ns, UNSEEN_NS if day else -1
+        self._name = name
+        self._segments = list(_segments(text, name))
+        self._told = False
+        self._stars_ns = utc_ns
+        self._unseen_ns = UNSEEN_NS if day else -1
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
         if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
@@ -84,10 +87,10 @@ class OemOrbit:
         """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest
         epoch, which is told once.
         """
-        found = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
+        segment = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
         if (
             not self._told
-            and _away_ns(found, utc_ns) > 0
+            and _away_ns(segment, utc_ns) > 0
             and abs(utc_ns - self._stars_ns) > self._unseen_ns
         ):
             log.warning(
@@ -96,8 +99,8 @@ class OemOrbit:
                 _date(utc_ns),
             )
             self._told = True
-        t_ns = int(np.clip(_time(found.scale, utc_ns), found.t_ns[0], found.t_ns[-1]))
-        return _at(found.t_ns, found.states, t_ns)
+        t_ns = int(np.clip(_time(segment.scale, utc_ns), segment.t_ns[0], segment.t_ns[-1]))
+        return _at(segment.t_ns, segment.states, t_ns)
 
 
 def _away_ns(segment: Segment, utc_ns: int) -> int:
@@ -150,7 +153,8 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
         if line in {"META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP"}:
             if line == "META_START":
                 yield from _segment(meta, rows, name)
-                meta, rows = {}, []
+                meta = {}
+                rows = []
             section = {"META_START": "metadata", "COVARIANCE_START": "covariance"}.get(line, "data")
         elif section in {"header", "metadata"}:
             key, equals, value = line.partition("=")
@@ -160,13 +164,13 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
                 )
             meta[key.strip()] = " ".join(value.upper().split())
         elif section == "data":
-            words = line.split()
-            if len(words) not in COUNTS:
+            fields = line.split()
+            if len(fields) not in COUNTS:
                 raise InputError(
                     f"{name}:{number}: {line[:40]!r}; write an epoch, X Y Z (km) and X_DOT Y_DOT"
                     " Z_DOT (km/s)"
                 )
-            rows.append([str(number), *words[:7]])
+            rows.append([str(number), *fields[:7]])
     if section == "metadata":
         raise InputError(f"{name}: ends in the metadata; is it cut off?")
     yield from _segment(meta, rows, name)
@@ -204,7 +208,8 @@ def _numbers(words: list[str], where: str) -> list[float]:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = [np.nan] * 6
-    place, speed = np.abs(numbers[:3]), np.abs(numbers[3:])
+    place = np.abs(numbers[:3])
+    speed = np.abs(numbers[3:])
     if not ((place < MAX_KM).all() and (speed < MAX_KM_S).all() and np.linalg.norm(place) > MIN_KM):
         raise InputError(
             f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s"

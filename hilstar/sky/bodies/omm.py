@@ -84,7 +84,8 @@ def read_omm(text: str, file: str) -> Iterator[OmmSet]:
         fields = {name: _text(value) for name, value in raw.items() if name and value is not None}
         name = fields.get("OBJECT_NAME", "")
         _check(fields, f"{where} ({shortened(name)})" if name else where)
-        satrec, number = Satrec(), int(fields["NORAD_CAT_ID"])
+        satrec = Satrec()
+        number = int(fields["NORAD_CAT_ID"])
         known = UNUSED | fields
         known["EPOCH"] = _epoch(fields["EPOCH"])
         known["NORAD_CAT_ID"] = str(min(number, MAX_SGP4_NUMBER))
@@ -113,15 +114,15 @@ def _fields(text: str, file: str) -> Iterator[Mapping[str, Any]]:
         else:
             yield from omm.parse_csv(io.StringIO(begin))
     except NOT_OMM as error:
-        said = f"{file}: is no OMM that can be read ({shortened(error)})"
-        raise InputError(f"{said}; {FORM}") from error
+        refusal = f"{file}: is no OMM that can be read ({shortened(error)})"
+        raise InputError(f"{refusal}; {FORM}") from error
 
 
 def _dictionaries(sets: list[Any], file: str) -> Iterator[Mapping[str, Any]]:
-    for count, each in enumerate(sets, start=1):
-        if not isinstance(each, dict):
+    for count, element_set in enumerate(sets, start=1):
+        if not isinstance(element_set, dict):
             raise InputError(f"{file}: element set {count} is no JSON object; {FORM}")
-        yield each
+        yield element_set
 
 
 def _of_kvn(text: str) -> Iterator[Mapping[str, Any]]:
@@ -139,7 +140,9 @@ def _of_kvn(text: str) -> Iterator[Mapping[str, Any]]:
 
 
 def _text(value: Any) -> str:
-    return repr(value) if isinstance(value, float) else str(value).strip()
+    if isinstance(value, float):
+        return repr(value)
+    return str(value).strip()
 
 
 def _check(fields: Mapping[str, str], where: str) -> None:

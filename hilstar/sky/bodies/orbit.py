@@ -59,14 +59,16 @@ class TleOrbit:
             raise MachineError(f"[spacecraft] orbit = a file of elements needs SGP4; {INSTALL}")
         from sgp4.api import SGP4_ERRORS, Satrec
 
-        self._name, self._errors = name, SGP4_ERRORS
+        self._name = name
+        self._errors = SGP4_ERRORS
         if is_omm(text):
             sets = list(read_omm(text, name))
             if len(sets) != 1:
                 raise InputError(
                     f"{name}: has {len(sets)} element sets, and an orbit is one; {TLE_ADVICE}"
                 )
-            self._satellite, self.number = sets[0].satrec, sets[0].number
+            self._satellite = sets[0].satrec
+            self.number = sets[0].number
         else:
             self._satellite = Satrec.twoline2rv(*_checked(name, text))
             self.number = int(self._satellite.satnum)
@@ -94,24 +96,24 @@ class TleOrbit:
 
 
 def _checked(name: str, text: str) -> tuple[str, str]:
-    found = [
+    tle_lines = [
         line
         for line in map(str.rstrip, text.splitlines())
         if line[:2] in {"1 ", "2 "} and len(line) == LINE_LENGTH
     ]
-    if [line[0] for line in found] != ["1", "2"]:
+    if [line[0] for line in tle_lines] != ["1", "2"]:
         raise InputError(
             f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2;"
             f" {TLE_ADVICE}"
         )
-    for number, line in enumerate(found, start=1):
+    for number, line in enumerate(tle_lines, start=1):
         total = sum(int(c) if c.isdigit() else c == "-" for c in line[:-1]) % 10
         if str(total) != line[-1]:
             raise InputError(
                 f"{name}: element line {number}: its digits add up to {total}, not {line[-1]};"
                 f" {TLE_ADVICE}"
             )
-    return found[0], found[1]
+    return tle_lines[0], tle_lines[1]
 
 
 @lru_cache(maxsize=8)

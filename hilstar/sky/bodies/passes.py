@@ -118,12 +118,12 @@ class Pass:
         below the horizon.
         """
         range_km = np.linalg.norm(self.seen_km[0], axis=1)[:, None]
-        towards, above, seen_km = self.seen_km[0] / range_km, air.above(utc_ns), self.seen_km.copy()
+        towards = self.seen_km[0] / range_km
+        above = air.above(utc_ns)
+        seen_km = self.seen_km.copy()
         seen_km[0] = above.bent(towards) * range_km
-        altitude_rad, standard = (
-            above.altitude_rad(towards),
-            self.brightness.standard_e_per_s.copy(),
-        )
+        altitude_rad = above.altitude_rad(towards)
+        standard = self.brightness.standard_e_per_s.copy()
         standard[self.index] *= air.shares(np.full(len(self), -1), altitude_rad).mean(axis=0) * (
             altitude_rad > 0
         )
@@ -139,9 +139,16 @@ class Pass:
 
         A velocity (3,) adds to that, within 1 mas.
         """
-        velocity = self.fixed_km_s if velocity_km_s is None else self.fixed_km_s + velocity_km_s
-        seen = _at(self.seen_km[:, which], seconds[:, None])
-        return aberrate(seen / np.sqrt(np.einsum("ij,ij->i", seen, seen))[:, None], velocity)
+        if velocity_km_s is None:
+            velocity = self.fixed_km_s
+        else:
+            velocity = self.fixed_km_s + velocity_km_s
+        from_observer_km = _at(self.seen_km[:, which], seconds[:, None])
+        return aberrate(
+            from_observer_km
+            / np.sqrt(np.einsum("ij,ij->i", from_observer_km, from_observer_km))[:, None],
+            velocity,
+        )
 
     def vectors_km(self, seconds: FloatArray) -> FloatArray:
         """From the observer to where each (n, 3) sent what arrives then, each at its own of
@@ -159,7 +166,8 @@ class Pass:
         """Mean electron rates (k,) between two times: by their middle's place, and in closed
         form what varies by itself.
         """
-        middle_s, listed = ((begin_s + end_s) / 2)[:, None], self.index[which]
+        middle_s = ((begin_s + end_s) / 2)[:, None]
+        listed = self.index[which]
         place = _at(self.place_km[:, which], middle_s)
         share = reflected_share(_at(self.seen_km[:, which], middle_s), place, self.now.sun_km)
         share = share * in_front(_at(self.observer_km[:, None], middle_s), place)
@@ -187,19 +195,26 @@ class Satellites:
         orbit: Orbit,
         zero_ns: int,
     ) -> None:
-        own = orbit.number if isinstance(orbit, TleOrbit) else None
+        if isinstance(orbit, TleOrbit):
+            own_number = orbit.number
+        else:
+            own_number = None
         self._v0_e_per_s = v0_e_per_s
-        self.names = tuple(one.name for one in satellites)
+        self.names = tuple(satellite.name for satellite in satellites)
         self.brightness = brightness
-        self._satellites, self._orbit, self._zero_ns = satellites, orbit, zero_ns
-        self._swarm = Swarm([one.satrec for one in satellites])
-        self._numbers = np.array([one.number for one in satellites])
+        self._satellites = satellites
+        self._orbit = orbit
+        self._zero_ns = zero_ns
+        self._swarm = Swarm([satellite.satrec for satellite in satellites])
+        self._numbers = np.array([satellite.number for satellite in satellites])
         self._other = (
-            np.ones(len(satellites), dtype=np.bool_) if own is None else self._numbers != own
+            np.ones(len(satellites), dtype=np.bool_)
+            if own_number is None
+            else self._numbers != own_number
         )
         self._watch: _Watch | None = None
         self._lost_told = self._own_told = self._age_told = False
-        self._epoch_age_days = np.array([one.age_days(0) for one in satellites])
+        self._epoch_age_days = np.array([satellite.age_days(0) for satellite in satellites])
         self.file = "satellites"  # what they are called in a line about their age
         self._lost = 0
         self.listed = 0  # in the table of magnitudes
@@ -212,36 +227,44 @@ class Satellites:
         """The satellites in a cone at a moment, and some more; None for none."""
         self.place(sky.utc_ns)
         observer = self._observer(sky)
-        found = self._watched(cone, sky, observer)
-        if not len(found):
+        in_cone = self._watched(cone, sky, observer)
+        if not len(in_cone):
             return None
-        seen = self._swarm.places_km(found, sky.utc_ns) - observer[0]
-        range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
-        reach_km, now = _reach_km(observer, cone.half_s), sky.now()
-        near = _within(seen @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, reach_km) & (
-            range_km > OWN_KM
+        from_observer_km = self._swarm.places_km(in_cone, sky.utc_ns) - observer[0]
+        range_km = np.sqrt(np.einsum("ij,ij->i", from_observer_km, from_observer_km))
+        reach_km = _reach_km(observer, cone.half_s)
+        now = sky.now()
+        near = _within(
+            from_observer_km @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, reach_km
+        ) & (range_km > OWN_KM)
+        near &= (
+            self._brightest(in_cone, from_observer_km, range_km, reach_km, now)
+            >= cone.faintest_e_per_s
         )
-        near &= self._brightest(found, seen, range_km, reach_km, now) >= cone.faintest_e_per_s
-        which = found[near]
+        which = in_cone[near]
         if not len(which):
             return None
-        place, seen = _light_cubics(
+        place, from_observer_km = _light_cubics(
             self._swarm.motion_km(which, sky.utc_ns), observer, now.earth_km_s
         )
         since_s = (sky.utc_ns - self._zero_ns) / NS_PER_S
-        return Pass(which, self.brightness, seen, place, observer, since_s, now, sky.fixed_km_s)
+        return Pass(
+            which, self.brightness, from_observer_km, place, observer, since_s, now, sky.fixed_km_s
+        )
 
     def _observer(self, sky: SkyAt) -> FloatArray:
         """The cubic (4, 3) of the observer's places about the Earth, seconds after the moment."""
         place_km, velocity_km_s = self._orbit.state(sky.utc_ns)
         if sky.place_km is not None:
             place_km = place_km + sky.place_km
-            velocity_km_s = (
-                velocity_km_s if sky.velocity_km_s is None else velocity_km_s + sky.velocity_km_s
-            )
+            if sky.velocity_km_s is not None:
+                velocity_km_s = velocity_km_s + sky.velocity_km_s
         # It falls about the Earth; at rest where it is the Earth's centre.
         distance = float(np.linalg.norm(place_km))
-        pull = -EARTH_GM_KM3_S2 / distance**3 if distance > 0 else 0.0
+        if distance > 0:
+            pull = -EARTH_GM_KM3_S2 / distance**3
+        else:
+            pull = 0.0
         return np.stack([place_km, velocity_km_s, pull / 2 * place_km, pull / 6 * velocity_km_s])
 
     def _watched(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
@@ -254,27 +277,35 @@ class Satellites:
         return watch.found
 
     def _search(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
-        seen = self._swarm.places_km(slice(None), sky.utc_ns) - observer[0]
-        range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
+        from_observer_km = self._swarm.places_km(slice(None), sky.utc_ns) - observer[0]
+        range_km = np.sqrt(np.einsum("ij,ij->i", from_observer_km, from_observer_km))
         self._tell_own(range_km)
         half_s = WATCH_S + cone.half_s
         reach_km = _reach_km(observer, half_s) + JUMP_KM
         near = (
-            _within(seen @ cone.axis, range_km, cone.radius_rad + WATCH_RAD + SHIFT_RAD, reach_km)
+            _within(
+                from_observer_km @ cone.axis,
+                range_km,
+                cone.radius_rad + WATCH_RAD + SHIFT_RAD,
+                reach_km,
+            )
             & self._other
         )
-        found = np.flatnonzero(near)
-        brightest = self._brightest(found, seen[found], range_km[found], reach_km, sky.now())
-        found = found[brightest >= cone.faintest_e_per_s]
+        candidates = np.flatnonzero(near)
+        brightest = self._brightest(
+            candidates, from_observer_km[candidates], range_km[candidates], reach_km, sky.now()
+        )
+        candidates = candidates[brightest >= cone.faintest_e_per_s]
         # What is in the shadow, or well behind the Earth, at both ends of an arc that is nearly
         # straight is so between them.
-        lit, sun_km = np.zeros(len(found)), sky.now().sun_km
+        lit = np.zeros(len(candidates))
+        sun_km = sky.now().sun_km
         for seconds in np.array([-half_s, half_s]):
-            place = self._swarm.places_km(found, sky.utc_ns, seconds)
+            place = self._swarm.places_km(candidates, sky.utc_ns, seconds)
             lit += sunlit_share(place, sun_km) * in_front(
                 _at(observer, seconds)[None], place, HIDDEN_KM
             )
-        return np.asarray(found[lit > 0])
+        return np.asarray(candidates[lit > 0])
 
     def _brightest(
         self,
@@ -358,12 +389,12 @@ class Satellites:
     def _tell_own(self, range_km: FloatArray) -> None:
         if self._own_told:
             return
-        own = np.flatnonzero(~self._other | (range_km < OWN_KM))
-        if len(own):
+        own_indices = np.flatnonzero(~self._other | (range_km < OWN_KM))
+        if len(own_indices):
             self._own_told = True
             log.warning(
                 "%s is the observer itself, or within %g km of it, and is not drawn",
-                self.names[int(own[0])],
+                self.names[int(own_indices[0])],
                 OWN_KM,
             )
 
@@ -413,16 +444,18 @@ def _light_cubics(
     """Cubics (4, n, 3) of where satellites sent what arrives, about the Earth and from the
     observer, by their places.
     """
-    seen = place_km - observer_km[:, None]
-    distance = np.sqrt(np.einsum("ij,ij->i", seen[0], seen[0]))
+    from_observer_km = place_km - observer_km[:, None]
+    distance = np.sqrt(np.einsum("ij,ij->i", from_observer_km[0], from_observer_km[0]))
     late_s = (distance / LIGHT_KM_S)[:, None]
-    receding = (np.einsum("ij,ij->i", seen[0], seen[1]) / distance / LIGHT_KM_S)[:, None]
+    receding = (
+        np.einsum("ij,ij->i", from_observer_km[0], from_observer_km[1]) / distance / LIGHT_KM_S
+    )[:, None]
     sent = place_km.copy()
     sent[0] -= late_s * (place_km[1] - late_s * place_km[2])
     sent[1] -= receding * place_km[1] + 2 * late_s * place_km[2]
-    seen = sent - observer_km[:, None]
+    from_observer_km = sent - observer_km[:, None]
     # Meanwhile the Earth, and what is about it, has moved on: that undoes the aberration by its
     # velocity.
-    seen[0] -= late_s * earth_km_s
-    seen[1] -= receding * earth_km_s
-    return sent, seen
+    from_observer_km[0] -= late_s * earth_km_s
+    from_observer_km[1] -= receding * earth_km_s
+    return sent, from_observer_km

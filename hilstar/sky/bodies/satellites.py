@@ -127,26 +127,30 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
     """
     if importlib.util.find_spec("sgp4") is None:
         raise MachineError(f"[sky.bodies] satellites need SGP4; {INSTALL}")
-    found: dict[int, Satellite] = {}
-    for one in _satellites(text, file):
-        number = one.number
-        other = found.get(number)
-        if other is None or abs(one.age_days(utc_ns)) < abs(other.age_days(utc_ns)):
-            found[number] = one
-    if not found:
+    by_number: dict[int, Satellite] = {}
+    for satellite in _satellites(text, file):
+        number = satellite.number
+        other = by_number.get(number)
+        if other is None or abs(satellite.age_days(utc_ns)) < abs(other.age_days(utc_ns)):
+            by_number[number] = satellite
+    if not by_number:
         raise InputError(f"{file}: no element set in it; {LIST_FORM}")
-    shared = Counter(one.name for one in found.values())
+    shared = Counter(satellite.name for satellite in by_number.values())
     names = (
         (
-            (one.name if shared[one.name] == 1 else f"{one.name} {one.number}")
-            if one.name
-            else f"NORAD {one.number}"
+            (
+                satellite.name
+                if shared[satellite.name] == 1
+                else f"{satellite.name} {satellite.number}"
+            )
+            if satellite.name
+            else f"NORAD {satellite.number}"
         )
-        for one in found.values()
+        for satellite in by_number.values()
     )
     return [
-        Satellite(name, one.number, one.satrec)
-        for name, one in zip(names, found.values(), strict=True)
+        Satellite(name, satellite.number, satellite.satrec)
+        for name, satellite in zip(names, by_number.values(), strict=True)
     ]
 
 
@@ -157,8 +161,8 @@ def _satellites(text: str, file: str) -> "Iterator[Satellite]":
     from sgp4.api import Satrec
 
     if is_omm(text):
-        for each in read_omm(text, file):
-            yield Satellite(_name(each.name), each.number, each.satrec)
+        for element_set in read_omm(text, file):
+            yield Satellite(_name(element_set.name), element_set.number, element_set.satrec)
         return
     for name, first, second in _sets(text, file):
         satrec = Satrec.twoline2rv(first, second)
@@ -167,7 +171,9 @@ def _satellites(text: str, file: str) -> "Iterator[Satellite]":
 
 def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
     """The name (empty where there is none), the first and the second line of each set."""
-    name, first, first_at = "", "", 0
+    name = ""
+    first = ""
+    first_at = 0
     for at, line in enumerate(text.splitlines(), start=1):
         line = line.rstrip()
         where = f"{file}:{at}"
@@ -186,10 +192,12 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
                     f" {LIST_FORM}"
                 )
             yield name, first, line
-            name, first = "", ""
+            name = ""
+            first = ""
         elif line.startswith("1 "):
             _check(line, where)
-            first, first_at = line, at
+            first = line
+            first_at = at
         elif line.startswith("2 "):
             raise InputError(f"{where}: element line 1 is missing before it; {LIST_FORM}")
         elif name:
@@ -274,7 +282,8 @@ class Brightness:
         return factor
 
     def _waved(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        ratio, per_s = flux_ratio(-self.amplitude_mag[which]), 1 / self.period_s[which]
+        ratio = flux_ratio(-self.amplitude_mag[which])
+        per_s = 1 / self.period_s[which]
         middle = ((begin_s + end_s) / 2 - self.flash_at_s[which]) * per_s
         depth = (ratio - 1) / (ratio + 1)
         return np.asarray(
@@ -284,7 +293,8 @@ class Brightness:
     def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
         from scipy.special import ndtr  # 0.1 s, which only flashes need
 
-        period_s, sigma_s = self.period_s[which], self.flash_s[which] / FWHM_SIGMAS
+        period_s = self.period_s[which]
+        sigma_s = self.flash_s[which] / FWHM_SIGMAS
         # The light of all flashes up to each end, in flashes: whole periods, and those near that
         # have not ended
         until = []
@@ -332,7 +342,8 @@ def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
     The area of two overlapping circles, in space stretched along the Earth's axis so that it is a
     sphere.
     """
-    place, sun = _stretched(place_km), _stretched(sun_km)
+    place = _stretched(place_km)
+    sun = _stretched(sun_km)
     distance = np.linalg.norm(place, axis=1)
     to_sun = sun - place
     far = np.linalg.norm(to_sun, axis=1)
@@ -364,7 +375,8 @@ def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.
 
     What is seen through less than `depth_km` of it counts as seen.
     """
-    observer, place = _stretched(observer_km), _stretched(place_km)
+    observer = _stretched(observer_km)
+    place = _stretched(place_km)
     way = place - observer
     share = np.clip(
         -np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0
@@ -463,7 +475,8 @@ def brightness_of(
 
     def column(name: str, default: float) -> np.ndarray:
         return np.array(
-            [rows.get(one.number, {}).get(name, default) for one in satellites], dtype=np.float64
+            [rows.get(satellite.number, {}).get(name, default) for satellite in satellites],
+            dtype=np.float64,
         )
 
     return Brightness(
@@ -512,7 +525,8 @@ class Swarm:
         return True
 
     def _load(self, k: int, part: slice, begin_ns: int, follows: bool) -> None:
-        last, error = self._ends[k], np.zeros(part.stop - part.start, dtype=np.uint8)
+        last = self._ends[k]
+        error = np.zeros(part.stop - part.start, dtype=np.uint8)
         if last is None or not follows:
             last, error = self._states(k, begin_ns)
         else:

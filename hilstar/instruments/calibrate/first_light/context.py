@@ -105,7 +105,8 @@ class FittedFigure(NamedTuple):
     @property
     def is_at_end(self) -> bool:
         """Whether the figure is at an end of its model."""
-        below, above = END_SHARE * abs(self.low), END_SHARE * abs(self.high)
+        below = END_SHARE * abs(self.low)
+        above = END_SHARE * abs(self.high)
         return not self.low + below < self.value < self.high - above
 
 
@@ -131,13 +132,13 @@ class StepOutcome:
         """This outcome; failed, and without its changes, where a figure is at an end of its
         model.
         """
-        at_end = [each for each in self.fitted if each.is_at_end]
+        at_end = [figure for figure in self.fitted if figure.is_at_end]
         if self.verdict != "done" or not at_end:
             return self
         ends = ", ".join(
-            f"{each.name} {each.value:.4g} is at an end of its model ({each.low:g} to"
-            f" {each.high:g})"
-            for each in at_end
+            f"{figure.name} {figure.value:.4g} is at an end of its model ({figure.low:g} to"
+            f" {figure.high:g})"
+            for figure in at_end
         )
         line = f"{self.line}; but {ends}, so it was not measured and nothing was changed"
         return dataclasses.replace(self, verdict="failed", line=line, changes=(), number=None)
@@ -190,14 +191,14 @@ def read_session(folder: Path) -> SessionFile | None:
     if not exists(path):
         return None
     try:
-        found = msgspec.json.decode(read_bytes(path, ADVICE, MAX_SESSION_BYTES), type=SessionFile)
+        session = msgspec.json.decode(read_bytes(path, ADVICE, MAX_SESSION_BYTES), type=SessionFile)
     except NOT_JSON as error:
         raise InputError(f"{path}: is no session ({shortened(error)}); {ADVICE}") from error
-    if found.kind != KIND:
+    if session.kind != KIND:
         raise InputError(
-            f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}"
+            f"{path}: kind = {shortened(repr(session.kind))} and {KIND!r} is wanted; {ADVICE}"
         )
-    return found
+    return session
 
 
 def write_session(folder: Path, session: SessionFile) -> None:
@@ -289,7 +290,9 @@ class StepContext:
     @property
     def truth(self) -> BenchFile | None:
         """The true bench of a virtual session, None otherwise."""
-        return self.source.truth if isinstance(self.source, VirtualBench) else None
+        if isinstance(self.source, VirtualBench):
+            return self.source.truth
+        return None
 
     @property
     def tracker_psf(self) -> Psf:
@@ -316,7 +319,8 @@ class StepContext:
         """The part of the screen that the tracker sees, by the figure of the step `orientation`
         where it was measured.
         """
-        geometry, psf_px = self.geometry(), psf_sigma_of(self.file)
+        geometry = self.geometry()
+        psf_px = psf_sigma_of(self.file)
         focal_px = self.known.get(f"orientation.{SEEN_FOCAL}")
         if focal_px is None:
             return SeenScreen(
@@ -344,11 +348,9 @@ class StepContext:
     def change(self, table: str, key: str, after: TomlValue) -> tuple[KeyChange, ...]:
         """The change of a key of the bench file; none where it is so already."""
         before = getattr(getattr(self.file.config, table), key)
-        return (
-            ()
-            if before == after
-            else (KeyChange(table=table, key=key, before=before, after=after),)
-        )
+        if before == after:
+            return ()
+        return (KeyChange(table=table, key=key, before=before, after=after),)
 
     @property
     def exposure_s(self) -> float:
@@ -379,11 +381,9 @@ class StepContext:
     def unlit(self) -> Path | None:
         """The tracker's image with the monitor switched off, None where there is none."""
         name = "unlit_000"
-        return (
-            self.kept[name]
-            if name in self.kept
-            else self.source.unlit(make_directory(self.folder) / name)
-        )
+        if name in self.kept:
+            return self.kept[name]
+        return self.source.unlit(make_directory(self.folder) / name)
 
     def dark(self, number: int = 0) -> Path:
         """Take the tracker's image of a black screen, the first or a further one."""
@@ -406,9 +406,12 @@ class StepContext:
                 f" {self.exposure_s:g} s: expose shorter, and write [tracker] exposure_s so; look"
                 " at the monitor's black level, and at other light"
             )
-        pixels, cold = self.pixels(path), dark < HOT_FILL * self.full_dn
-        seen = software_image(pixels, self.file.config.tracker.detector)
-        return DarkSubtracted(path, seen - dark, float(pixels[cold].max(initial=0.0)), floor_dn)
+        pixels = self.pixels(path)
+        cold = dark < HOT_FILL * self.full_dn
+        pixel_light = software_image(pixels, self.file.config.tracker.detector)
+        return DarkSubtracted(
+            path, pixel_light - dark, float(pixels[cold].max(initial=0.0)), floor_dn
+        )
 
     def read(self, path: Path) -> FloatArray:
         """An image of the tracker (h, w), DN, of a mosaic its superpixels."""

@@ -188,19 +188,19 @@ def sharpness(
     shape = _started(dots, dot_side_px, turn)
     dots = _first(dots, max(MAX_ALL_POINTS // len(shape.points), MIN_DOTS + 3))
     fit = _fitted(dots, shape, dot_side_px, background.noise, noise)
-    each, usable = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
+    dot_sigmas, usable = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
     if usable.sum() >= MIN_DOTS and not usable.all():
         dots = _Dots(dots.values[usable], dots.x_px[usable], dots.y_px[usable], half)
         fit = _fitted(dots, fit.shape, dot_side_px, background.noise, noise)
-        each, _ = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
+        dot_sigmas, _ = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
     sigma_px = fit.shape.sigma_px
-    by_scatter = float(np.std(each)) / math.sqrt(len(each))
+    by_scatter = float(np.std(dot_sigmas)) / math.sqrt(len(dot_sigmas))
     by_model = math.hypot(MODEL_SHARE * sigma_px, EDGE_SHARE * fit.shape.side_px)
     error_px = math.hypot(max(fit.sigma_error_px, by_scatter), by_model)
     return Sharpness(
         x_px=np.rint(dots.x_px) + fit.places[:, 0],
         y_px=np.rint(dots.y_px) + fit.places[:, 1],
-        each_psf_sigma_px=each,
+        each_psf_sigma_px=dot_sigmas,
         psf_sigma_px=sigma_px,
         psf_sigma_error_px=error_px,
         dot_side_px=fit.shape.side_px,
@@ -216,15 +216,16 @@ def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, 
     height, width = image.shape
     apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px))
     apart += np.where(np.eye(len(x_px), dtype=bool), np.inf, 0.0)
-    column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
+    column = np.rint(x_px).astype(np.intp)
+    row = np.rint(y_px).astype(np.intp)
     whole = (column >= half) & (column < width - half) & (row >= half) & (row < height - half)
-    kept = np.flatnonzero(whole & (apart.min(axis=1, initial=np.inf) > 2 * half))[:MAX_DOTS]
+    lone = np.flatnonzero(whole & (apart.min(axis=1, initial=np.inf) > 2 * half))[:MAX_DOTS]
     steps = np.arange(-half, half + 1)
     values = (
-        image[(row[kept, None] + steps)[:, :, None], (column[kept, None] + steps)[:, None, :]]
+        image[(row[lone, None] + steps)[:, :, None], (column[lone, None] + steps)[:, None, :]]
         - level
     )
-    return _Dots(np.asarray(values, dtype=np.float64), x_px[kept], y_px[kept], half)
+    return _Dots(np.asarray(values, dtype=np.float64), x_px[lone], y_px[lone], half)
 
 
 def _points(sigma_px: float, side_px: float, turn: float) -> FloatArray:
@@ -232,20 +233,21 @@ def _points(sigma_px: float, side_px: float, turn: float) -> FloatArray:
     count = int(np.clip(math.ceil(POINTS_A_SIGMA * side_px / sigma_px), MIN_POINTS, MAX_POINTS))
     along = (np.arange(count) + 0.5) / count - 0.5
     x, y = (part.ravel() for part in np.meshgrid(along, along))
-    cos, sin = math.cos(turn), math.sin(turn)
+    cos = math.cos(turn)
+    sin = math.sin(turn)
     return np.column_stack([cos * x - sin * y, sin * x + cos * y])
 
 
 def _started(dots: _Dots, side_px: float, turn: float) -> _Shape:
     """The PSF's sigma, of some, that leaves the smallest squares."""
     few = _first(dots, MIN_DOTS)
-    left = []
+    misfits = []
     for sigma_px in STARTS_PX:
         shape = _Shape(_points(float(sigma_px), side_px, turn), float(sigma_px), side_px)
-        own = _slopes(shape, _first_places(few), few.half_px)[0]
-        flux, level = _amplitudes(own, few.values)
-        left.append(float(((few.values - flux * own - level) ** 2).sum()))
-    best = float(STARTS_PX[int(np.argmin(left))])
+        model = _slopes(shape, _first_places(few), few.half_px)[0]
+        flux, level = _amplitudes(model, few.values)
+        misfits.append(float(((few.values - flux * model - level) ** 2).sum()))
+    best = float(STARTS_PX[int(np.argmin(misfits))])
     return _Shape(_points(best / 2, side_px, turn), best, side_px)
 
 
@@ -321,19 +323,22 @@ def _fitted(
     Levenberg and Marquardt's steps; each dot's own light, background and place are eliminated from
     the normal equations.
     """
-    shape, places, damping = start, _first_places(dots), FIRST_DAMPING
-    value, settled = math.inf, False
+    shape = start
+    places = _first_places(dots)
+    damping = FIRST_DAMPING
+    value = math.inf
+    settled = False
     for _ in range(ROUNDS):
-        own, *slopes = _slopes(shape, places, dots.half_px)
-        flux, level = _amplitudes(own, dots.values)
-        weight = _weights(own, flux, noise_dn, noise)
-        off = (dots.values - flux * own - level) * weight
+        model, *slopes = _slopes(shape, places, dots.half_px)
+        flux, level = _amplitudes(model, dots.values)
+        weight = _weights(model, flux, noise_dn, noise)
+        off = (dots.values - flux * model - level) * weight
         columns = (
-            np.stack([own, np.ones_like(own), *(flux * each for each in slopes)], axis=1)
+            np.stack([model, np.ones_like(model), *(flux * slope for slope in slopes)], axis=1)
             * weight[:, None]
         )
-        columns = columns.reshape(len(own), 6, -1)
-        right = columns @ off.reshape(len(own), -1, 1)
+        columns = columns.reshape(len(model), 6, -1)
+        right = columns @ off.reshape(len(model), -1, 1)
         normal = columns @ columns.transpose(0, 2, 1)
         normal += 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(6)
         by_own = np.linalg.solve(
@@ -341,7 +346,7 @@ def _fitted(
         )
         common = (normal[:, 4:, 4:] - normal[:, 4:, :4] @ by_own[:, :, :2]).sum(axis=0)
         aim = (right[:, 4:] - normal[:, 4:, :4] @ by_own[:, :, 2:]).sum(axis=0)[:, 0]
-        chi2 = max(float((off**2).sum()) / max(off.size - 4 * len(own), 1), 1.0)
+        chi2 = max(float((off**2).sum()) / max(off.size - 4 * len(model), 1), 1.0)
         # The side is known beforehand to SIDE_SHARE; its weight grows with the misfit as the
         # pixels' own does.
         known = chi2 / SIDE_SHARE**2
@@ -358,7 +363,10 @@ def _fitted(
         side = shape.side_px * math.exp(float(np.clip(step[1], -0.05, 0.05)))
         turn = math.atan2(*(shape.points[-1] - shape.points[0])[::-1]) - math.pi / 4
         shape = _Shape(_points(sigma_px, side, turn), sigma_px, side)
-        damping = damping / 3 if float((off**2).sum()) <= value else damping * 5
+        if float((off**2).sum()) <= value:
+            damping = damping / 3
+        else:
+            damping = damping * 5
         value = float((off**2).sum())
         if settled:
             break
@@ -373,22 +381,24 @@ def _each_sigma(
     """The PSF's sigma by each dot (n,), with the side of all, and which dots agree with the
     others (n,).
     """
-    own, by_x, by_y, by_sigma, _ = _slopes(shape, places, dots.half_px)
-    flux, level = _amplitudes(own, dots.values)
-    weight = _weights(own, flux, noise_dn, noise)
-    off = ((dots.values - flux * own - level) * weight).reshape(len(own), -1, 1)
+    model, by_x, by_y, by_sigma, _ = _slopes(shape, places, dots.half_px)
+    flux, level = _amplitudes(model, dots.values)
+    weight = _weights(model, flux, noise_dn, noise)
+    off = ((dots.values - flux * model - level) * weight).reshape(len(model), -1, 1)
     columns = (
-        np.stack([own, np.ones_like(own), flux * by_x, flux * by_y, flux * by_sigma], axis=1)
+        np.stack([model, np.ones_like(model), flux * by_x, flux * by_y, flux * by_sigma], axis=1)
         * weight[:, None]
     )
-    columns = columns.reshape(len(own), 5, -1)
+    columns = columns.reshape(len(model), 5, -1)
     normal = columns @ columns.transpose(0, 2, 1)
     steps = np.linalg.solve(
         normal + 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(5), columns @ off
     )[:, 4, 0]
-    each = np.clip(shape.sigma_px + steps, *SIGMAS_PX)
-    far = np.abs(each - np.median(each))
-    return each, far <= WILD_SIGMAS * 1.4826 * max(float(np.median(far)), 1e-3 * shape.sigma_px)
+    dot_sigmas = np.clip(shape.sigma_px + steps, *SIGMAS_PX)
+    far = np.abs(dot_sigmas - np.median(dot_sigmas))
+    return dot_sigmas, far <= WILD_SIGMAS * 1.4826 * max(
+        float(np.median(far)), 1e-3 * shape.sigma_px
+    )
 
 
 class SharpDots(NamedTuple):
@@ -405,25 +415,26 @@ def focus(context: StepContext) -> StepOutcome:
     """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises
     InputError.
     """
-    code, found, looked = sharp_dots(context)
+    code, sharp, looked = sharp_dots(context)
     wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
-    sigma, error = found.psf_sigma_px, found.psf_sigma_error_px
+    sigma = sharp.psf_sigma_px
+    error = sharp.psf_sigma_error_px
     picture = context.session / "focus.svg"
     finding = (
-        f"PSF sigma {sigma:.3f} px (by {len(found.x_px)} dots), the bench file has {wanted:.4g}"
+        f"PSF sigma {sigma:.3f} px (by {len(sharp.x_px)} dots), the bench file has {wanted:.4g}"
     )
     with chart(picture, finding, height_inch=6.0) as (axes,):
-        dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
+        dots = axes.scatter(sharp.x_px, sharp.y_px, c=sharp.each_psf_sigma_px, cmap="viridis", s=60)
         axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
         axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
         axes.invert_yaxis()
-    pixel_px = found.dot_side_px / DOT_PX
+    pixel_px = sharp.dot_side_px / DOT_PX
     figures: dict[str, Figure] = {
         "psf_sigma_px": sigma,
         "psf_sigma_error_px": error,
         "monitor_pixel_px": pixel_px,
-        "monitor_pixel_error_px": found.dot_side_error_px / DOT_PX,
-        "dots": len(found.x_px),
+        "monitor_pixel_error_px": sharp.dot_side_error_px / DOT_PX,
+        "dots": len(sharp.x_px),
         "dot_code": code,
     }
     files: tuple[Path, ...] = looked.path, picture
@@ -433,11 +444,12 @@ def focus(context: StepContext) -> StepOutcome:
         f" {code}"
     )
     line += f", a monitor pixel is {pixel_px:.3f} px"
-    effective = _effective(looked, found)
+    effective = _effective(looked, sharp)
     if effective is not None:
         drawn = context.session / "psf.svg"
         draw_effective(drawn, effective)
-        files, pictures = (*files, drawn), (picture, drawn)
+        files = (*files, drawn)
+        pictures = (picture, drawn)
         figures["effective_psf_rms"] = effective.chosen.rms
         line += (
             f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the"
@@ -445,24 +457,27 @@ def focus(context: StepContext) -> StepOutcome:
         )
     number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:.4g}")
     verdict: Verdict = "done"
-    if not found.has_settled:
+    if not sharp.has_settled:
         why = (
             f"the fit of the dots has not settled in {ROUNDS} rounds: look at the dots' image, and"
             " at the focal lengths"
         )
-        line, verdict = f"{line}: {why}", "failed"
+        line = f"{line}: {why}"
+        verdict = "failed"
     elif error > MAX_ERROR_SHARE * sigma:
         why = (
             f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer"
             " [tracker] exposure_s"
         )
-        line, verdict = f"{line}: {why}", "failed"
+        line = f"{line}: {why}"
+        verdict = "failed"
     elif sigma > BLURRED * wanted + BLURRED_BY_PX:
         cure = (
             "turn the focus until this figure is smallest (--again focus), or write [tracker]"
             " psf_sigma_px as it is"
         )
-        line, verdict = f"{line}: {cure}", "failed"
+        line = f"{line}: {cure}"
+        verdict = "failed"
     fitted = (FittedFigure("PSF sigma", sigma, *SIGMAS_PX),)
     return StepOutcome(verdict, line, figures, files, pictures, number=number, fitted=fitted)
 
@@ -483,8 +498,9 @@ def sharp_dots(context: StepContext) -> SharpDots:
     """Lower the dots' code until they do not saturate the tracker, and measure them. Raises
     InputError.
     """
-    seen, code = context.seen_screen, context.white
-    plan = first_dots(seen)
+    seen_screen = context.seen_screen
+    code = context.white
+    plan = first_dots(seen_screen)
     dark = context.read(context.dark())
     for number in range(context.file.config.monitor.bits * 2):
         codes = dot_image(plan, 0, context.resolution_px, code)
@@ -493,7 +509,9 @@ def sharp_dots(context: StepContext) -> SharpDots:
             break
         code = context.darker(code)
     return SharpDots(
-        code, seen_sharpness(looked.image, seen, context.file.config.tracker.detector), looked
+        code,
+        seen_sharpness(looked.image, seen_screen, context.file.config.tracker.detector),
+        looked,
     )
 
 

@@ -118,7 +118,8 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
     """The figure in the middle of what the bench file's ideal lens shows the tracker. Raises
     InputError without space.
     """
-    monitor, tracker = geometry.monitor, geometry.tracker
+    monitor = geometry.monitor
+    tracker = geometry.tracker
     ratio = monitor.focal_length_px / tracker.focal_length_px
     reach = FIGURE_REACH * min(
         *monitor.resolution_px, *(ratio * size for size in tracker.resolution_px)
@@ -134,11 +135,10 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
     )
     width, height = monitor.resolution_px
     if not (abs(middle_x - width / 2) < width / 4 and abs(middle_y - height / 2) < height / 4):
-        middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
-    x_px, y_px = (
-        middle_x + reach * np.array([-1.0, 1.0, -1.0]),
-        middle_y + reach * np.array([-1.0, -1.0, 1.0]),
-    )
+        middle_x = (width - 1) / 2
+        middle_y = (height - 1) / 2
+    x_px = middle_x + reach * np.array([-1.0, 1.0, -1.0])
+    y_px = middle_y + reach * np.array([-1.0, -1.0, 1.0])
     return OrientationFigure(x_px, y_px, side, reach)
 
 
@@ -179,28 +179,28 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
     background = noisiest_background(image)
-    found = find_stars(image, settings, background)
-    if len(found) < len(SQUARES):
-        raise InputError(f"{len(found)} of the figure's three squares are in the image; {NOT_SEEN}")
-    largest = np.argsort(-found.pixels, kind="stable")[:MAX_SPOTS]
+    stars = find_stars(image, settings, background)
+    if len(stars) < len(SQUARES):
+        raise InputError(f"{len(stars)} of the figure's three squares are in the image; {NOT_SEEN}")
+    largest = np.argsort(-stars.pixels, kind="stable")[:MAX_SPOTS]
     # By light, for a wide PSF makes spots of nearly one size of squares of three.
-    radius_px = math.ceil(WINDOW_SIDES * math.sqrt(found.pixels.max()))
+    radius_px = math.ceil(WINDOW_SIDES * math.sqrt(stars.pixels.max()))
     values, dx, dy = squares(
-        image, background.level, found.x_px[largest], found.y_px[largest], radius_px
+        image, background.level, stars.x_px[largest], stars.y_px[largest], radius_px
     )
     light = values.sum(axis=(1, 2))
     brightest = np.argsort(-light, kind="stable")[: len(SQUARES)]
     step = light[brightest[:-1]] / np.maximum(light[brightest[1:]], 1e-9)
     if (step < MIN_LIGHT_STEP).any():
-        told = ", ".join(f"{each:.3g}" for each in light[brightest])
+        light_text = ", ".join(f"{square_light:.3g}" for square_light in light[brightest])
         raise SquaresAlike(
-            f"the three brightest spots have {told} DN in all and cannot be told apart, where"
+            f"the three brightest spots have {light_text} DN in all and cannot be told apart, where"
             " squares of three sizes have 9, 4 and 1 parts; look at stray light and reflections,"
             " or expose shorter"
         )
     right, down = ((values * offset).sum(axis=(1, 2)) / light for offset in (dx, dy))
     which = largest[brightest]
-    return found.x_px[which] + right[brightest], found.y_px[which] + down[brightest]
+    return stars.x_px[which] + right[brightest], stars.y_px[which] + down[brightest]
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
@@ -213,24 +213,35 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
     shown_x, shown_y = geometry.to_monitor(x_px, y_px)
     corner, right, below = np.stack([shown_x, shown_y], axis=1)
-    seen = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
-    scale = float(np.sqrt(abs(np.linalg.det(seen))))
+    figure_px = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
+    scale = float(np.sqrt(abs(np.linalg.det(figure_px))))
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
         raise InputError(
             f"the figure is {scale:.2f} times as large as the bench file says; look at focal"
             " lengths and pitches"
         )
     ways = {way: np.array(way, dtype=np.float64).reshape(2, 2) for way in WAYS}
-    way = max(ways, key=lambda each: float((ways[each] * seen).sum()))
-    left = np.linalg.inv(ways[way]) @ seen / scale
-    longest, shortest = np.linalg.svd(left, compute_uv=False)
+    way = max(ways, key=lambda each: float((ways[each] * figure_px).sum()))
+    remaining_map = np.linalg.inv(ways[way]) @ figure_px / scale
+    longest, shortest = np.linalg.svd(remaining_map, compute_uv=False)
     if longest > MAX_STRETCH * shortest:
         raise InputError(
             f"the figure is no square: {longest / shortest:.2f} times as long one way as the other;"
             " look at stray light, and at how far the screen is tilted"
         )
-    turn = float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1])))
-    sides = np.degrees([np.arctan2(left[1, 0], left[0, 0]), np.arctan2(-left[0, 1], left[1, 1])])
+    turn = float(
+        np.degrees(
+            np.arctan2(
+                remaining_map[1, 0] - remaining_map[0, 1], remaining_map[0, 0] + remaining_map[1, 1]
+            )
+        )
+    )
+    sides = np.degrees(
+        [
+            np.arctan2(remaining_map[1, 0], remaining_map[0, 0]),
+            np.arctan2(-remaining_map[0, 1], remaining_map[1, 1]),
+        ]
+    )
     by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / (2 * figure.reach_px))
     turn_error = math.hypot(float(sides[0] - sides[1]) / 2, by_spots)
     # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the
@@ -254,7 +265,8 @@ def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
 
 def look_of(way: tuple[int, int, int, int]) -> str:
     """Where the figure's squares appear in this orientation, in words."""
-    right, below = (way[0], way[2]), (way[1], way[3])
+    right = (way[0], way[2])
+    below = (way[1], way[3])
     corner = CORNERS[-right[0] - below[0], -right[1] - below[1]]
     return (
         f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]}"
@@ -285,10 +297,9 @@ def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> Scree
     """
     wanted = mounting.matrix @ np.linalg.inv(np.array(way, dtype=np.float64).reshape(2, 2))
     flips = (False, True)
-    all_ways = [
-        ScreenMounting(x, y, turn)
-        for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))
-    ]
+    all_ways = []
+    for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270)):
+        all_ways.append(ScreenMounting(x, y, turn))
     right = [each for each in all_ways if np.allclose(each.matrix, wanted)]
     return min(
         right,
@@ -330,28 +341,37 @@ def orientation(context: StepContext) -> StepOutcome:
         ):
             made = "; ".join(change.line for change in changes)
             raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
-    way = f"first {WAYS[first]}, now upright" if changes else "upright"
+    if changes:
+        way = f"first {WAYS[first]}, now upright"
+    else:
+        way = "upright"
     if measured is None:
         figures: dict[str, Figure] = {"seen": WAYS[first], "told_by": "a key"}
         return StepOutcome("done", f"{way}, as a person saw it", figures, changes=changes)
-    found, looked = measured
-    turn_deg = found.whole_turn_deg
+    seen_figure, looked = measured
+    turn_deg = seen_figure.whole_turn_deg
     picture = context.session / "orientation.svg"
     draw_spots(
-        picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}"
+        picture,
+        looked.image,
+        seen_figure.x_px,
+        seen_figure.y_px,
+        f"the figure as the tracker sees it: {way}",
     )
     figures = {
         "seen": WAYS[first],
-        "scale": found.scale,
+        "scale": seen_figure.scale,
         "turn_deg": turn_deg,
-        "turn_error_deg": found.turn_error_deg,
+        "turn_error_deg": seen_figure.turn_error_deg,
     }
     figures |= {
-        SEEN_FOCAL: found.focal_length_px,
-        **dict(zip(SEEN_Q, found.q_cam_to_mon.tolist(), strict=True)),
+        SEEN_FOCAL: seen_figure.focal_length_px,
+        **dict(zip(SEEN_Q, seen_figure.q_cam_to_mon.tolist(), strict=True)),
     }
-    line = f"{way}, {found.scale:.4f} of the expected size, turned by {turn_deg:+.2f} deg"
-    number = StepNumber(turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
+    line = f"{way}, {seen_figure.scale:.4f} of the expected size, turned by {turn_deg:+.2f} deg"
+    number = StepNumber(
+        turn_deg, seen_figure.turn_error_deg, "deg", "turn of the figure that is left"
+    )
     return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
 
 
@@ -364,24 +384,27 @@ def _way(
 ) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
     """The figure's orientation, and its measurement; None where a person pressed a key instead."""
     geometry = context.geometry()
-    figure, keys = figure_for(geometry), keys_of_ways()
-    code, tries = context.white, 0
+    figure = figure_for(geometry)
+    keys = keys_of_ways()
+    code = context.white
+    tries = 0
     while True:
         shown = name if not tries else f"{name}_dim{tries}"
         pattern = figure.pattern(shown, context.resolution_px, code)
-        told = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
-        if isinstance(told, str):
-            return keys[told], None
-        looked = context.looked(told, context.read(context.dark()))
+        answer = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
+        if isinstance(answer, str):
+            return keys[answer], None
+        looked = context.looked(answer, context.read(context.dark()))
         try:
-            found = see_figure(looked.image, figure, geometry)
+            seen_figure = see_figure(looked.image, figure, geometry)
         except SquaresAlike:
             # Squares that saturate the tracker are alike: darker ones are not.
             if not context.is_too_bright(looked):
                 raise
-            code, tries = context.darker(code), tries + 1
+            code = context.darker(code)
+            tries = tries + 1
         else:
-            return found.way, (found, looked)
+            return seen_figure.way, (seen_figure, looked)
 
 
 def draw_spots(
@@ -430,42 +453,48 @@ def geometry(context: StepContext) -> StepOutcome:
     make_directory(context.folder)
     dark = context.dark()
     first = first_dots(context.seen_screen)
-    paths, seen = _frames_of(context, first, 0, code, dark)
-    rough = rough_geometry(context.file, first, seen)
+    paths, observed = _frames_of(context, first, 0, code, dark)
+    rough = rough_geometry(context.file, first, observed)
     second = plan_seen_dots(rough, FRAMES, lit_for(rough), np.random.default_rng(PLAN_SEED))
     more_paths, more_seen = _frames_of(context, second, first.frames, code, dark)
-    plan, paths = joined(first, second), [*paths, *more_paths]
+    plan = joined(first, second)
+    paths = [*paths, *more_paths]
     write_plan(context.folder / "plan.csv", plan)
     ideal = context.file.config.tracker.distortion is None
-    context.stage(f"fits lenses to {len(seen) + len(more_seen)} centroids")
-    found = calibrate_seen(context.file, plan, seen.joined(more_seen), tracker_is_ideal=ideal)
-    output, picture = context.session / "geometry.toml", context.session / "geometry.svg"
-    write_calibrated(output, found, picture, context.source.monitor)
-    chosen, error = found.chosen, found.uncertainty
+    context.stage(f"fits lenses to {len(observed) + len(more_seen)} centroids")
+    calibrated = calibrate_seen(
+        context.file, plan, observed.joined(more_seen), tracker_is_ideal=ideal
+    )
+    output = context.session / "geometry.toml"
+    picture = context.session / "geometry.svg"
+    write_calibrated(output, calibrated, picture, context.source.monitor)
+    chosen = calibrated.chosen
+    error = calibrated.uncertainty
     figures: dict[str, Figure] = {
         "model": chosen.name,
         "held_out_rms_arcsec": chosen.rms_arcsec,
         "held_out_max_arcsec": chosen.max_arcsec,
         "error_rms_arcsec": error.rms_arcsec,
         "error_max_arcsec": error.max_arcsec,
-        "noise_px": found.problem.noise_px,
-        "dots_recognised": found.recognised,
-        "dots_planned": len(found.plan),
-        "centroids_lost": int(found.lost),
-        "centroids_false": int(found.false),
+        "noise_px": calibrated.problem.noise_px,
+        "dots_recognised": calibrated.recognised,
+        "dots_planned": len(calibrated.plan),
+        "centroids_lost": int(calibrated.lost),
+        "centroids_false": int(calibrated.false),
         **{
-            name: each.value
-            for name, each in parameters_of(found).items()
+            name: parameter.value
+            for name, parameter in parameters_of(calibrated).items()
             if "rotation" not in name
         },
-        "notes": "; ".join(notes_for_a_person(found)) or "none",
+        "notes": "; ".join(notes_for_a_person(calibrated)) or "none",
     }
     line = (
         f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
         f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
     )
     files = (output, picture, context.folder / "plan.csv", dark, *paths)
-    rms, points = chosen.rms_arcsec, len(found.data)
+    rms = chosen.rms_arcsec
+    points = len(calibrated.data)
     number = StepNumber(
         rms,
         rms / math.sqrt(4 * points),
@@ -473,7 +502,9 @@ def geometry(context: StepContext) -> StepOutcome:
         "rms distance of held-out dots from where the fit has them",
     )
     changes = context.names("collimator", "geometry", output)
-    return StepOutcome("done", line, figures, files, (picture,), changes, number, _ends_of(found))
+    return StepOutcome(
+        "done", line, figures, files, (picture,), changes, number, _ends_of(calibrated)
+    )
 
 
 def _frames_of(
@@ -482,14 +513,15 @@ def _frames_of(
     """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises
     InputError.
     """
-    paths = [
-        context.take(
-            Pattern(
-                f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)
+    paths = []
+    for frame in range(plan.frames):
+        paths.append(
+            context.take(
+                Pattern(
+                    f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)
+                )
             )
         )
-        for frame in range(plan.frames)
-    ]
     size_px = context.file.config.tracker.resolution_px
     context.stage(f"measures the dots of {len(paths)} images")
     return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
@@ -499,10 +531,11 @@ def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
     """The tilts, and where dots are farther off than their noise the degree of the field: a
     larger one was not tried.
     """
-    tilts = [
-        FittedFigure(name, parameters_of(found)[name].value, -MAX_TILT_DEG, MAX_TILT_DEG)
-        for name in ("tilt_x_deg", "tilt_y_deg")
-    ]
+    tilts = []
+    for name in ("tilt_x_deg", "tilt_y_deg"):
+        tilts.append(
+            FittedFigure(name, parameters_of(found)[name].value, -MAX_TILT_DEG, MAX_TILT_DEG)
+        )
     if found.chosen.rms_arcsec > FAR * found.held_out_noise_arcsec:
         tilts.append(
             FittedFigure(

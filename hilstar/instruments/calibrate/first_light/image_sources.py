@@ -106,14 +106,16 @@ def black(resolution_px: tuple[int, int]) -> CodeImage:
 def on_screen(codes: CodeImage, orientation: Orientation) -> CodeImage:
     """Turn an image as the screen is mounted, as shaders/present.frag does."""
     screen = np.rot90(codes, -orientation.quarter_turns)
-    screen = screen[:, ::-1] if orientation.flip_x else screen
+    if orientation.flip_x:
+        screen = screen[:, ::-1]
     return screen[::-1] if orientation.flip_y else screen
 
 
 def off_screen(screen: CodeImage, orientation: Orientation) -> CodeImage:
     """The inverse of `on_screen`."""
     screen = screen[::-1] if orientation.flip_y else screen
-    screen = screen[:, ::-1] if orientation.flip_x else screen
+    if orientation.flip_x:
+        screen = screen[:, ::-1]
     return np.rot90(screen, orientation.quarter_turns)
 
 
@@ -190,11 +192,11 @@ def complete_images(folder: Path) -> dict[str, Path]:
     """The images in a directory by name without ending, except the newest, which may be
     incomplete.
     """
-    found = [
+    images = [
         path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE
     ]
-    found.sort(key=lambda path: path.stat().st_mtime_ns)
-    return {path.stem: path for path in found[:-1]}
+    images.sort(key=lambda path: path.stat().st_mtime_ns)
+    return {path.stem: path for path in images[:-1]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +254,8 @@ def _presenter(
     """A presenter of codes (h, w) or (h, w, 3) for the window, and the function that frees its
     texture.
     """
-    monitor, triples = file.config.monitor, None
+    monitor = file.config.monitor
+    triples = None
     if codes.ndim == 3:
         packed = codes.astype(np.int64) @ np.array([1 << 32, 1 << 16, 1])
         colours, levels = np.unique(packed, return_inverse=True)
@@ -275,7 +278,8 @@ class PatternFrames:
     """Hands the patterns that are shown to watchers, as a run hands on its frames."""
 
     def __init__(self, sender: FrameSender) -> None:
-        self._sender, self._number = sender, 0
+        self._sender = sender
+        self._number = 0
 
     def send(self, file: BenchFile, codes: CodeImage, lit_ns: int) -> None:
         """Hand on codes (h, w) or (h, w, 3) that are lit since `lit_ns`, where somebody watches."""
@@ -338,9 +342,13 @@ class PatternDisplay(Closing):
         Raises Stopped where the window is closed, MachineError where the display goes away.
         """
         window = self._window_for(file)
-        pause_s = 0.5 / file.config.monitor.refresh_hz if pattern.later else POLL_S
+        if pattern.later:
+            pause_s = 0.5 / file.config.monitor.refresh_hz
+        else:
+            pause_s = POLL_S
         shown = [_presenter(file, window, codes) for codes in pattern.frames]
-        start_s, number = time.monotonic(), 0
+        start_s = time.monotonic()
+        number = 0
         handed_on_s = -math.inf
         window.keys.clear()  # keys pressed during the pattern before
         try:
@@ -378,7 +386,8 @@ class PatternDisplay(Closing):
             screen = Screen(window, bench)
             pass_gate(screen, self.force)
             bench.draw(None)
-            due_s, done = time.monotonic(), begin()
+            due_s = time.monotonic()
+            done = begin()
             while not done():
                 light.append(screen.present(len(light)) or 0)
                 if not screen.clock.paced_by_screen:
@@ -416,17 +425,19 @@ class _ShownHere(ImageSource):
     _shows = False  # whether a command shows the patterns
 
     def __init__(self, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
-        self._display, self._dark, self._diode = PatternDisplay(), dark, diode
+        self._display = PatternDisplay()
+        self._dark = dark
+        self._diode = diode
         self.forced = self._display.forced
 
     def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
         if self._shows:
             return
         self._display.force = force
-        found = check_monitor(file, identity_here(file.config.monitor.display), today)
-        found.refuse(force)
-        self.monitor = found.now
-        self._display.forced += found.told(log)
+        monitor_check = check_monitor(file, identity_here(file.config.monitor.display), today)
+        monitor_check.refuse(force)
+        self.monitor = monitor_check.now
+        self._display.forced += monitor_check.told(log)
 
     def gate(self, file: BenchFile) -> Timing | None:
         return None if self._shows else self._display.gate(file)
@@ -440,7 +451,9 @@ class _ShownHere(ImageSource):
         return self._dark
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        return None if self._diode is None else self._diode.watch(self._display, file, seconds)
+        if self._diode is None:
+            return None
+        return self._diode.watch(self._display, file, seconds)
 
     def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
         if self._shows:
@@ -487,13 +500,13 @@ class GrabCommand(_ShownHere):
         """
         output = stem.with_name(stem.name + ".png")
         shown = stem.parent / PATTERN_FILE
-        words = self._words
+        command = self._words
         for name, value in (
             ("output", str(output)),
             ("pattern", str(shown)),
             ("exposure_s", f"{exposure_s:.9g}"),
         ):
-            words = [word.replace(f"{{{name}}}", value) for word in words]
+            command = [word.replace(f"{{{name}}}", value) for word in command]
         # an interrupted attempt may have left one, and a command that writes nothing must fail
         output.unlink(missing_ok=True)
         if self._shows and pattern.later:
@@ -504,9 +517,9 @@ class GrabCommand(_ShownHere):
         if self._shows:
             monitor = file.config.monitor
             write_codes_png(shown, on_screen(pattern.codes, orientation_of(monitor)), monitor.bits)
-            _run(words, output, _wait)
+            _run(command, output, _wait)
         else:
-            _run(words, output, lambda done: self._display.show_until(file, pattern, done))
+            _run(command, output, lambda done: self._display.show_until(file, pattern, done))
         return output
 
 
@@ -591,7 +604,8 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
 
     with ExitStack() as ended:
         meanwhile(done)
-        child, code = started[0], started[0].poll()
+        child = started[0]
+        code = started[0].poll()
     command = shortened(shlex.join(words))
     if child.too_much:
         raise NoImage(
@@ -626,11 +640,10 @@ class ByHand(_ShownHere):
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Wait for a complete image of the pattern."""
-        exposed = (
-            ""
-            if exposure_s == file.config.tracker.exposure_s
-            else f", exposed for {exposure_s:.4g} s,"
-        )
+        if exposure_s == file.config.tracker.exposure_s:
+            exposed = ""
+        else:
+            exposed = f", exposed for {exposure_s:.4g} s,"
         asked = (
             f"now save the tracker's image{exposed} as {stem}.png (or .fits); q on the display ends"
         )
@@ -695,13 +708,18 @@ class VirtualBench(ImageSource):
     """
 
     def __init__(self, bench: BenchFile, truth: BenchFile, seed: int) -> None:
-        self.truth, self._seed, self.sets_exposure = truth, seed, True
+        self.truth = truth
+        self._seed = seed
+        self.sets_exposure = True
         self.identity = f"virtual: sha256 {truth.sha256}, seed {seed}"
         refuse_other_bench(bench, truth)
         config = truth.config
         with open_bench(truth) as real:
-            self._panel, camera, psf = real.panel, real.camera, real.tracker_psf
-            self._mosaic, self._primaries_seen = DisplayColours.of(real), seen_primaries(real)
+            self._panel = real.panel
+            camera = real.camera
+            psf = real.tracker_psf
+            self._mosaic = DisplayColours.of(real)
+            self._primaries_seen = seen_primaries(real)
         tracker = config.tracker
         self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
         self._optics = TwinOptics(self.geometry, psf)
@@ -723,11 +741,11 @@ class VirtualBench(ImageSource):
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """The tracker's image of a pattern: a PNG of 16 bits."""
-        mine, its = orientation_of(file.config.monitor), orientation_of(self.truth.config.monitor)
-        frames = [
-            np.ascontiguousarray(off_screen(on_screen(codes, mine), its))
-            for codes in pattern.frames
-        ]
+        mine = orientation_of(file.config.monitor)
+        its = orientation_of(self.truth.config.monitor)
+        frames = []
+        for codes in pattern.frames:
+            frames.append(np.ascontiguousarray(off_screen(on_screen(codes, mine), its)))
         shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
         image = self._image_e_per_s(
             [frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)]
@@ -777,7 +795,8 @@ class VirtualBench(ImageSource):
             (self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode()))
         )
         pixels = self._detector.expose(mean_e, exposure_s, rng)
-        image, path = png_of(pixels), stem.with_name(stem.name + ".png")
+        image = png_of(pixels)
+        path = stem.with_name(stem.name + ".png")
         written(path, lambda file: file.write(image))
         self._newest = path, pixels
         return path
@@ -815,7 +834,8 @@ class VirtualBench(ImageSource):
 
         A pattern with one level is drawn once and scaled for others.
         """
-        brightest, primary = float(light.e_per_s.max(initial=0.0)), self._primaries_seen[number]
+        brightest = float(light.e_per_s.max(initial=0.0))
+        primary = self._primaries_seen[number]
         if not brightest:
             return np.zeros_like(self._glow_e_per_s)
         if not (light.e_per_s == brightest).all():
@@ -847,10 +867,9 @@ class VirtualBench(ImageSource):
         if codes.ndim == 1 and not apart:
             return [LitLight(place, self._panel.response.light[codes])]
         by_primary = np.broadcast_to(codes.T, (3, len(place)))
-        lights = [
-            LitLight(place, table[its])
-            for table, its in zip(self._primaries, by_primary, strict=True)
-        ]
+        lights = []
+        for table, its in zip(self._primaries, by_primary, strict=True):
+            lights.append(LitLight(place, table[its]))
         if apart:
             return lights
         return [LitLight(place, np.sum([light.e_per_s for light in lights], axis=0))]
@@ -861,8 +880,8 @@ class VirtualBench(ImageSource):
             white = self._panel.flux_at_white_e_per_s
             return np.array(
                 [
-                    one.response.light * (one.flux_at_white_e_per_s / white)
-                    for one in self._panel.primaries
+                    primary.response.light * (primary.flux_at_white_e_per_s / white)
+                    for primary in self._panel.primaries
                 ]
             )
         monitor = self.truth.config.monitor
@@ -879,7 +898,8 @@ class MaskImages:
     """
 
     def __init__(self, size_px: tuple[int, int], count: int) -> None:
-        self._shape, self._count = size_px[::-1], count
+        self._shape = size_px[::-1]
+        self._count = count
         self._parts: dict[bytes, tuple[slice, slice, Float32Array]] = {}
 
     def __contains__(self, key: bytes) -> bool:
@@ -945,7 +965,8 @@ def virtual_diode(
 
 def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
     """Refuse (InputError) a truth whose screen or tracker does not match the bench file's."""
-    mine, its = bench.config, truth.config
+    mine = bench.config
+    its = truth.config
     screens = [orientation_of(c.monitor).screen_px(c.monitor.resolution_px) for c in (mine, its)]
     if screens[0] != screens[1]:
         sizes = "{} x {} px and the bench file's is {} x {}".format(*screens[1], *screens[0])

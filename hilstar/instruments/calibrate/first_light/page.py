@@ -43,9 +43,10 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
     """Write the page of a session, with its bench file as it was and as it is. Raises InputError
     where it cannot be written.
     """
-    bench, records = Path(session.bench), {record.name: record for record in session.steps}
+    bench = Path(session.bench)
+    records = {record.name: record for record in session.steps}
     links = "".join(_link(record) for record in session.steps)
-    parts = [Verdict(BAD, "Forced", each).html() for each in session.forced]
+    parts = [Verdict(BAD, "Forced", forced_check).html() for forced_check in session.forced]
     parts.append(f'<nav class="steps" aria-label="Steps">{links}</nav>')
     for step in STEPS:
         if step.name in records:
@@ -74,7 +75,10 @@ def _bench_file(session: SessionFile, before: Path) -> Card:
 
 
 def _verdict(records: list[StepRecord]) -> Verdict:
-    by = {verdict: [each.name for each in records if each.verdict == verdict] for verdict in WORDS}
+    by = {
+        verdict: [record.name for record in records if record.verdict == verdict]
+        for verdict in WORDS
+    }
     passed = f"{len(by['done'])} of {len(records)} steps passed"
     missed = ""
     if by["skipped"]:

@@ -121,7 +121,10 @@ def field_for(
     )
     corner = []  # the top left of a square about the middle of what is seen, kept on the screen
     for middle, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
-        wanted = middle if math.isfinite(middle) else (size - 1) / 2
+        if math.isfinite(middle):
+            wanted = middle
+        else:
+            wanted = (size - 1) / 2
         corner.append(
             int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest))
         )
@@ -141,7 +144,8 @@ def _seen(
 ) -> tuple[slice, slice]:
     """The rows and columns of the tracker's image that the square and its wings cover."""
     along = np.linspace(0, side - 1, 33)
-    low, high = np.zeros_like(along), np.full_like(along, side - 1)
+    low = np.zeros_like(along)
+    high = np.full_like(along, side - 1)
     x = corner[0] + np.concatenate([along, along, low, high])
     y = corner[1] + np.concatenate([low, high, along, along])
     place = geometry.to_tracker(x, y)
@@ -149,7 +153,8 @@ def _seen(
         raise InputError("the middle of the tracker's field sees no screen; run the geometry again")
     ends = []
     for part, size in zip(place, geometry.tracker.resolution_px, strict=True):
-        first, last = math.floor(part.min() - margin), math.ceil(part.max() + margin) + 1
+        first = math.floor(part.min() - margin)
+        last = math.ceil(part.max() + margin) + 1
         if first < 0 or last > size:
             raise InputError(
                 "the dots are not whole in the tracker's field; look at [collimator] and run the"
@@ -173,8 +178,10 @@ def monitor_area(
         part.reshape(y.shape) for part in geometry.to_monitor(x.ravel(), y.ravel())
     )
     # Half the cross product of a quadrangle's diagonals.
-    down_x, down_y = corner_x[1:, 1:] - corner_x[:-1, :-1], corner_y[1:, 1:] - corner_y[:-1, :-1]
-    up_x, up_y = corner_x[:-1, 1:] - corner_x[1:, :-1], corner_y[:-1, 1:] - corner_y[1:, :-1]
+    down_x = corner_x[1:, 1:] - corner_x[:-1, :-1]
+    down_y = corner_y[1:, 1:] - corner_y[:-1, :-1]
+    up_x = corner_x[:-1, 1:] - corner_x[1:, :-1]
+    up_y = corner_y[:-1, 1:] - corner_y[1:, :-1]
     area = np.nan_to_num(np.abs(down_x * up_y - down_y * up_x)) / 2
     width, height = geometry.monitor.resolution_px
     middle_x = (corner_x[1:, 1:] + corner_x[:-1, :-1]) / 2
@@ -243,7 +250,9 @@ class LatticeRatio:
     @property
     def sigmas(self) -> float:
         """How far the ratio is from 1, in its standard errors."""
-        return abs(self.ratio - 1) / self.error if self.error else 0.0
+        if self.error:
+            return abs(self.ratio - 1) / self.error
+        return 0.0
 
     @property
     def words(self) -> str:
@@ -258,7 +267,9 @@ class LatticeRatio:
 
 
 def _exposed(times: int) -> str:
-    return f", exposed {times} times longer" if times > 1 else ""
+    if times > 1:
+        return f", exposed {times} times longer"
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +343,10 @@ class PixelScatter:
 
     def add(self, patch: Patch, at: Range, image: FloatArray) -> None:
         """Take in an image (h, w), DN."""
-        place = (patch, at) if patch.code else (BLACK, Range(1, at.times))
+        if patch.code:
+            place = (patch, at)
+        else:
+            place = (BLACK, Range(1, at.times))
         before = self._before.get(place)
         if before is not None:
             # Half the square of a difference is the variance of each of the two, where pixels'
@@ -360,14 +374,17 @@ class PixelScatter:
         """The variance of light over light, DN: by the images of lit patterns; as the detector is
         stated without repeats.
         """
-        variance, light = 0.0, 0.0
+        variance = 0.0
+        light = 0.0
         for (patch, at), squares in self._squares.items():
             dark = self._sums.get((BLACK, Range(1, at.times)))
             if not patch.code or dark is None:
                 continue
             variance += sum(squares) - len(squares) * self.dark_dn2(at.times)
             light += len(squares) * (self._sums[patch, at] - dark)
-        return max(variance / light, 0.0) if light > 0 else self.default_dn_per_e
+        if light > 0:
+            return max(variance / light, 0.0)
+        return self.default_dn_per_e
 
     def sum_dn2(self, light_dn: float, times: int, blacks: float = 1.0) -> float:
         """The variance of a sum above black; `blacks` is the variance of the black sum relative to
@@ -427,8 +444,10 @@ class Photometer:
         longest_s: float = 0.0,
     ) -> None:
         geometry = context.real_geometry()
-        self.context, self.assumed = context, assumed
-        self.pairs, self.longest_s = pairs, longest_s
+        self.context = context
+        self.assumed = assumed
+        self.pairs = pairs
+        self.longest_s = longest_s
         light_map = bench_calibration(context.file.config, context.file.folder)
         even = light_map.uniformity_map(context.resolution_px)
         self._even_relative = light_map.uniformity_relative or 0.0
@@ -534,7 +553,10 @@ class Photometer:
         fits = np.flatnonzero(peaks <= highest_dn)
         place = int(fits[0]) if len(fits) else len(peaks) - 1
         times = 1
-        longest_s = self.longest_s if self.context.source.sets_exposure else 0.0
+        if self.context.source.sets_exposure:
+            longest_s = self.longest_s
+        else:
+            longest_s = 0.0
         while peaks[place] * times < FAINT_DN and self.exposure_s * times * LONGER <= longest_s:
             times *= LONGER
         return Range(self.periods[place], times)
@@ -566,7 +588,7 @@ class Photometer:
                 chosen[patch] = Range(at.period) if at.times > 1 else Range(2 * at.period)
             fixed.add(patch)
             sums[order] = total
-        return {times: np.array(each) for times, each in blacks.items()}, sums
+        return {times: np.array(black_sums) for times, black_sums in blacks.items()}, sums
 
     def _pairs(
         self,
@@ -586,7 +608,7 @@ class Photometer:
                 lights.append(self._both(name, patch, more, less))
             scale = self._dots(less) / self._dots(more)
             means = [float(mean) for mean in np.mean(lights, axis=0)]
-            ratios = tuple(one / other * scale for one, other in lights)
+            ratios = tuple(patch_light / other * scale for patch_light, other in lights)
             yield _Pair(patch, more, less, (means[0], means[1]), ratios)
 
     def _both(self, name: str, patch: Patch, more: Range, less: Range) -> tuple[float, float]:
@@ -636,7 +658,8 @@ class Photometer:
     ) -> _Values:
         """Light above black of each patch, and the standard error of its own images."""
         count = len(planned)
-        light, per_dn = np.zeros(count), np.zeros(count)
+        light = np.zeros(count)
+        per_dn = np.zeros(count)
         # On a black screen every pixel glows alike; the repeats tell how well that is known.
         to_black = 1 / (self.field.monitor_px * self.exposure_s)
         sigma = np.full(count, math.sqrt(self.scatter.dark_dn2(1)) * to_black)
@@ -686,7 +709,8 @@ class Photometer:
         """
         factors = {(channel, Range(self.periods[-1])): 1.0 for channel in self.assumed.light}
         for link in reversed(links):
-            more, less = Range(link.dense, link.times[0]), Range(link.sparse, link.times[1])
+            more = Range(link.dense, link.times[0])
+            less = Range(link.sparse, link.times[1])
             channel = link.patch.channel
             factors[channel, more] = factors[channel, less] * link.ratio
         return factors
@@ -780,7 +804,8 @@ class Photometer:
         """The noise of a pixel before the ADC, DN, by the variance of the field's sum and that
         sum.
         """
-        detector, pixels = self.context.file.config.tracker.detector, self.field.tracker_px
+        detector = self.context.file.config.tracker.detector
+        pixels = self.field.tracker_px
         # How far a level is above the offset, rounding tells to half a step.
         light_dn = max(sum_dn / pixels - detector.offset_dn - HALF_STEP_DN, 0.0)
         read_dn2 = (detector.electronics_e / detector.gain_e_per_dn) ** 2
@@ -820,8 +845,10 @@ class Photometer:
         # noise is not that of the lattices' exposure: the black screen is taken again.
         screens = [self._dark_screen, self.context.take(self._black_screen(1))]
         self.images += [screens[1], unlit]
-        parts, under = [self._part(path) for path in screens], self._part(unlit)
-        glowing_dn, dark_dn = float(np.mean([part.sum() for part in parts])), float(under.sum())
+        parts = [self._part(path) for path in screens]
+        under = self._part(unlit)
+        glowing_dn = float(np.mean([part.sum() for part in parts]))
+        dark_dn = float(under.sum())
         more_dn = glowing_dn - dark_dn
         seconds = self.field.monitor_px * self.context.exposure_s
         # The screen that is switched off has the noise of the other, less that of the glow.

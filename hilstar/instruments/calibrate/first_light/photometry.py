@@ -69,7 +69,10 @@ def photometry(context: StepContext) -> StepOutcome:
         )
     assumed = calibration_of(context)
     apart = drives_apart(context.file.config)
-    channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing or apart else "w"
+    if context.file.config.render.bit_stealing or apart:
+        channels = "".join(PRIMARIES)
+    else:
+        channels = "w"
     planned = plan_for(monitor.bits, context.patches, channels)
     by_channel = {"w": assumed.response.light}
     if apart:
@@ -78,8 +81,8 @@ def photometry(context: StepContext) -> StepOutcome:
         )
         shares = shares_of_white(context.file)
         by_channel = {
-            name: share * one.light
-            for name, share, one in zip(channels, shares, responses, strict=True)
+            name: share * response.light
+            for name, share, response in zip(channels, shares, responses, strict=True)
         }
     elif channels != "w":
         by_channel = dict(
@@ -94,7 +97,7 @@ def photometry(context: StepContext) -> StepOutcome:
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
-    found = calibrate_photometric(
+    calibration = calibrate_photometric(
         measured,
         output,
         Provenance("", "", instrument, "DN/s"),
@@ -109,7 +112,9 @@ def photometry(context: StepContext) -> StepOutcome:
     now = written.response
     errors = read_toml(output).errors
     black_error = 0.0 if errors is None else errors.black
-    figures = _response_figures(context, readings, found, (assumed.response, now), black_error)
+    figures = _response_figures(
+        context, readings, calibration, (assumed.response, now), black_error
+    )
     if written.weights is not None:
         figures["shares_of_white"] = ", ".join(
             f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True)
@@ -135,10 +140,11 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
     """The plan with the most levels that has at most `patches` patches. Raises InputError where
     they are too few.
     """
-    plans = [
-        plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
-        for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1)
-    ]
+    plans = []
+    for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1):
+        plans.append(
+            plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
+        )
     if len(plans[0]) > patches:
         raise InputError(
             f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for"
@@ -184,10 +190,12 @@ def _response_figures(
             if readings.black_known
             else "no: give --dark, an image with the monitor switched off"
         ),
-        "held_out_rms_mag": max(each["rms_mag"] for each in held),
-        "held_out_p95_mag": max(MAG_PER_RELATIVE * each["p95_percent"] / 100 for each in held),
-        "held_out_p95_sigmas": max(each["p95_sigmas"] for each in held),
-        "held_out_max_mag": max(each["max_mag"] for each in held),
+        "held_out_rms_mag": max(channel_figures["rms_mag"] for channel_figures in held),
+        "held_out_p95_mag": max(
+            MAG_PER_RELATIVE * channel_figures["p95_percent"] / 100 for channel_figures in held
+        ),
+        "held_out_p95_sigmas": max(channel_figures["p95_sigmas"] for channel_figures in held),
+        "held_out_max_mag": max(channel_figures["max_mag"] for channel_figures in held),
         "noise_percent": 100 * found["noise_relative"],
         "drift_percent": float("nan") if found["drift_percent"] is None else found["drift_percent"],
         "patches": len(readings.patches),
@@ -272,8 +280,8 @@ def response_error_mag(assumed: Response, true: Response) -> FloatArray:
     """How much fainter each code is than assumed (n,), magnitudes, from three decades below
     white to white.
     """
-    seen = true.light[1:] >= DIM_LIGHT
-    return np.asarray(magnitude(true.light[1:][seen] / assumed.light[1:][seen]))
+    is_bright = true.light[1:] >= DIM_LIGHT
+    return np.asarray(magnitude(true.light[1:][is_bright] / assumed.light[1:][is_bright]))
 
 
 def exponent(response: Response) -> float:

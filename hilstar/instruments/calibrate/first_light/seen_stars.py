@@ -80,9 +80,10 @@ class StarSpot:
         # A sprite's shares are those of whole pixels, and each pixel is a square of light: a
         # twelfth of its area each.
         drawn = [ratio * math.sqrt(width**2 + 2 / 12) for width in sprite]
-        own = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))
+        psf_scale = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))
         x, y = (
-            math.hypot(own * a, b) for a, b in zip(context.tracker_psf.width_px, drawn, strict=True)
+            math.hypot(psf_scale * a, b)
+            for a, b in zip(context.tracker_psf.width_px, drawn, strict=True)
         )
         detector = context.file.config.tracker.detector
         gain_e_per_dn = detector.gain_e_per_dn
@@ -202,7 +203,7 @@ class Beyond(NamedTuple):
             weight.sum()
         )
         bounds = (more, more - ONE_SIDED * error, more + ONE_SIDED * error)
-        sigma, low, high = (math.sqrt(max(each, 0.0)) for each in bounds)
+        sigma, low, high = (math.sqrt(max(variance, 0.0)) for variance in bounds)
         return cls(sigma, low, high)
 
 
@@ -264,15 +265,15 @@ class StarsSeen:
         """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and
         its errors.
         """
-        left = off_mag - self.codes_mag[used]
-        left = left - np.median(left)
+        centred_mag = off_mag - self.codes_mag[used]
+        centred_mag = centred_mag - np.median(centred_mag)
         error = np.sqrt(self.noise_mag[used] ** 2 + STAR_MAG**2)
         x, y = self.screen[used].T
         return Scatter(
-            rms_mag=float(np.sqrt((left**2).mean())),
+            rms_mag=float(np.sqrt((centred_mag**2).mean())),
             error_mag=float(np.sqrt((error**2).mean())),
-            by_place=_explained(left, x, y, x**2 + y**2),
-            by_light=_explained(left, np.log(self.e_per_s[used])),
+            by_place=_explained(centred_mag, x, y, x**2 + y**2),
+            by_light=_explained(centred_mag, np.log(self.e_per_s[used])),
         )
 
 
@@ -294,7 +295,7 @@ class Scatter:
         """What is wrong and what to do where the scatter is far above its error; else ""."""
         if self.rms_mag <= FAR * self.error_mag:
             return ""
-        told = (
+        scatter_text = (
             f"the light of stars scatters by {self.rms_mag:.3f} mag rms where they are known to"
             f" {self.error_mag:.3f}"
         )
@@ -313,7 +314,7 @@ class Scatter:
                 f"{self.by_light:.0%} of it follows the light asked for: measure the response"
                 " (--again photometry, --patches N)"
             )
-        return f"{told}; {why}"
+        return f"{scatter_text}; {why}"
 
 
 def _explained(off: FloatArray, *shapes: FloatArray) -> float:
@@ -325,8 +326,8 @@ def _explained(off: FloatArray, *shapes: FloatArray) -> float:
     total = float(((off - off.mean()) ** 2).sum())
     if free < 1 or not total:
         return 0.0
-    left = off - design @ np.linalg.lstsq(design, off, rcond=None)[0]
-    return float(1 - (left**2).sum() / free / (total / (len(off) - 1)))
+    residual = off - design @ np.linalg.lstsq(design, off, rcond=None)[0]
+    return float(1 - (residual**2).sum() / free / (total / (len(off) - 1)))
 
 
 def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
@@ -350,7 +351,9 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
                     Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy())
                     for number in exposed
                 )
-            codes = tuple(bench.code_values(each).astype(np.uint16) for each in levels)
+            codes = tuple(
+                bench.code_values(field_stars).astype(np.uint16) for field_stars in levels
+            )
             shown.append((codes, _alone(bench, context, frame, levels, spot)))
     fields = []
     for number, (codes, wanted) in enumerate(shown):
@@ -360,20 +363,22 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
         ]
         patterns = [Pattern(name, codes[0], codes[1:]) for name in names]
         fields.append(_compared(context, patterns, dark, wanted, spot))
-    arrays = [
-        field.name
-        for field in dataclasses.fields(StarsSeen)
-        if field.name not in {"lost", "frames", "images"}
-    ]
-    seen = StarsSeen(
-        **{name: np.concatenate([getattr(each, name) for each in fields]) for name in arrays},
-        lost=sum(each.lost for each in fields),
+    arrays = []
+    for field in dataclasses.fields(StarsSeen):
+        if field.name not in {"lost", "frames", "images"}:
+            arrays.append(field.name)
+    stars_seen = StarsSeen(
+        **{
+            name: np.concatenate([getattr(field_stars, name) for field_stars in fields])
+            for name in arrays
+        },
+        lost=sum(field_stars.lost for field_stars in fields),
         frames=frames,
-        images=(*dark_paths, *(path for each in fields for path in each.images)),
+        images=(*dark_paths, *(path for field_stars in fields for path in field_stars.images)),
     )
-    if len(seen.dn) < MIN_STARS:
-        raise InputError(_why_few(seen, spot, len(shown)))
-    return seen
+    if len(stars_seen.dn) < MIN_STARS:
+        raise InputError(_why_few(stars_seen, spot, len(shown)))
+    return stars_seen
 
 
 def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
@@ -387,11 +392,10 @@ def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
             " (--again photometry), look at [render] flux_at_white_e_per_s, or run the geometry"
             " again (--again geometry)"
         )
-    wide = (
-        f"a star's sigma is {spot.mean_sigma_px:.1f} px"
-        if spot.mean_sigma_px > 2
-        else "the field has few bright stars"
-    )
+    if spot.mean_sigma_px > 2:
+        wide = f"a star's sigma is {spot.mean_sigma_px:.1f} px"
+    else:
+        wide = "the field has few bright stars"
     return (
         f"{told}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag,"
         " so that faint stars are shown brighter, or a larger [sky] faintest_v_mag"
@@ -414,7 +418,8 @@ def _fields(
     """Attitudes (4,) of the fields with the most stars that can be read, of random ones and of
     those at bright stars.
     """
-    stars, rng = bench.stars, np.random.default_rng(SEED)
+    stars = bench.stars
+    rng = np.random.default_rng(SEED)
     per_e = context.exposure_s / spot.gain_e_per_dn
     dn = stars.electrons_per_s * per_e
     largest_dn = MAX_FILL * context.full_dn / spot.peak_share
@@ -438,9 +443,9 @@ def _fields(
         in_cam = vectors @ to_matrix(q).T
         with np.errstate(invalid="ignore", over="ignore"):
             inside = in_cam[:, 2] > 0
-            for one, edge in ((camera, margin), (bench.camera, MIN_EDGE_PX)):
-                x, y = one.project(in_cam @ one.cam_to_image.T)
-                width, height = one.resolution_px
+            for side_camera, edge in ((camera, margin), (bench.camera, MIN_EDGE_PX)):
+                x, y = side_camera.project(in_cam @ side_camera.cam_to_image.T)
+                width, height = side_camera.resolution_px
                 inside &= (x > edge) & (x < width - edge) & (y > edge) & (y < height - edge)
         counts.append(int(inside.sum()))
     order = np.argsort(-np.array(counts), kind="stable")[:MAX_FIELDS]
@@ -459,31 +464,35 @@ def _alone(
     tracker's image.
     """
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
-    truth, vectors = frame.rows, bench.stars.directions(frame.star)
+    truth = frame.rows
+    vectors = bench.stars.directions(frame.star)
     place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
     width, height = camera.resolution_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
     limits = np.array(context.resolution_px) - 1 - MIN_EDGE_PX
     edge_px = max(MIN_EDGE_PX, spot.radius_px + 2.0)
     # No planets: their light is known to 0.05 mag only, and a disc may be wide.
-    kept = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
-    kept &= bench.stars.row[frame.star] >= 0
-    kept &= (place > edge_px).all(axis=1) & (place < np.array([width, height]) - 1 - edge_px).all(
-        axis=1
-    )
-    kept &= (screen > MIN_EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
+    is_usable = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
+    is_usable &= bench.stars.row[frame.star] >= 0
+    is_usable &= (place > edge_px).all(axis=1) & (
+        place < np.array([width, height]) - 1 - edge_px
+    ).all(axis=1)
+    is_usable &= (screen > MIN_EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
     finite = np.where(np.isfinite(place), place, -1e6)
     light = np.asarray(truth["electrons_per_s"], dtype=np.float64)
     near = cKDTree(finite).query_ball_point(finite, ALONE_RADII * spot.radius_px + 2)
-    beside = np.array([light[each].sum() for each in near]) - light if len(light) else light
-    kept &= beside < BESIDE_SHARE * light
+    if len(light):
+        beside = np.array([light[neighbours].sum() for neighbours in near]) - light
+    else:
+        beside = light
+    is_usable &= beside < BESIDE_SHARE * light
     middle = (np.array(context.resolution_px) - 1) / 2
     return ExpectedStars(
-        hip=truth["hip"][kept],
-        place_px=place[kept],
-        e_per_s=light[kept],
-        screen=(screen[kept] - middle) / middle,
-        codes_mag=_codes_mag(bench, context, frame, levels, screen[kept], spot),
+        hip=truth["hip"][is_usable],
+        place_px=place[is_usable],
+        e_per_s=light[is_usable],
+        screen=(screen[is_usable] - middle) / middle,
+        codes_mag=_codes_mag(bench, context, frame, levels, screen[is_usable], spot),
     )
 
 
@@ -498,7 +507,7 @@ def _codes_mag(
     """How much fainter the codes are than the light asked for (n,), magnitudes, within the
     tracker's window.
     """
-    shown = np.mean([shown_light(each, bench.panel) for each in levels], axis=0)
+    shown = np.mean([shown_light(frame_levels, bench.panel) for frame_levels in levels], axis=0)
     geometry = context.geometry()
     reach = math.ceil(
         (spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
@@ -521,7 +530,8 @@ def _compared(
 ) -> StarsSeen:
     """The stars found in the mean of a field's images, against those that should be there."""
     first = context.look(patterns[0], dark)
-    paths, total = [first.path], first.image
+    paths = [first.path]
+    total = first.image
     for pattern in patterns[1:]:
         looked = context.look(pattern, dark)
         paths.append(looked.path)
@@ -529,34 +539,36 @@ def _compared(
     images = len(paths)
     image = total / images
     background = noisiest_background(image, 1 / images)
-    found, noise_dn = find_stars(image, spot.settings, background), background.noise
-    seen = np.stack([found.x_px, found.y_px], axis=1)
+    stars = find_stars(image, spot.settings, background)
+    noise_dn = background.noise
+    places_px = np.stack([stars.x_px, stars.y_px], axis=1)
     count = len(wanted.e_per_s)
-    far, nearest = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
-    if len(seen) and count:
-        far, nearest = (np.asarray(part) for part in cKDTree(seen).query(wanted.place_px))
+    far = np.full(count, np.inf)
+    nearest = np.zeros(count, dtype=np.intp)
+    if len(places_px) and count:
+        far, nearest = (np.asarray(part) for part in cKDTree(places_px).query(wanted.place_px))
     near = far < max(MIN_REACH_PX, spot.mean_sigma_px)
     expected_dn = wanted.e_per_s * context.exposure_s / spot.gain_e_per_dn
     brighter = 1.0
     if near.sum() >= MIN_STARS:  # the screen may give more or less light than the bench file says
         brighter = float(
-            np.median(found.flux[nearest[near]] / spot.window_share / expected_dn[near])
+            np.median(stars.flux[nearest[near]] / spot.window_share / expected_dn[near])
         )
     matched = near.copy()
-    dn = found.flux[nearest[near]] / spot.window_share
+    dn = stars.flux[nearest[near]] / spot.window_share
     matched[near] = spot.light_noise_mag(dn, noise_dn) < READ_MAG
     peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
     chosen = nearest[matched]
-    dn = found.flux[chosen] / spot.window_share
+    dn = stars.flux[chosen] / spot.window_share
     shared = dataclasses.replace(spot, frames=images)
     noise_mag = shared.light_noise_mag(dn, noise_dn)
     whole_dn = np.maximum(dn * spot.window_share, 1e-9)
     rounded = shared.rounded_dn(dn, noise_dn) / whole_dn[:, None]
-    saturated = found.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
+    saturated = stars.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
     return StarsSeen(
         hip=wanted.hip[matched],
         place_px=wanted.place_px[matched],
-        residual_px=seen[chosen] - wanted.place_px[matched],
+        residual_px=places_px[chosen] - wanted.place_px[matched],
         place_noise_px=shared.place_noise_px(dn, noise_dn),
         dn=dn,
         e_per_s=wanted.e_per_s[matched],

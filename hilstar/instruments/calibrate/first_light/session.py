@@ -119,12 +119,12 @@ def latency(context: StepContext) -> StepOutcome:
 
 def machine(context: StepContext) -> StepOutcome:
     """Check the machine. Raises MachineError for what it lacks."""
-    found = examine()
-    missing = [check for check in found.checks if check.required and not check.ok]
+    examined = examine()
+    missing = [check for check in examined.checks if check.required and not check.ok]
     if missing:
         raise MachineError("; ".join(f"{check.name}: {check.detail}" for check in missing))
-    figures = {check.name: check.detail for check in found.checks}
-    passed = sum(check.required for check in found.checks)  # all of them
+    figures = {check.name: check.detail for check in examined.checks}
+    passed = sum(check.required for check in examined.checks)  # all of them
     number = StepNumber(passed, None, f"of {passed}", "checks passed of what hilstar needs")
     return StepOutcome("done", f"OpenGL by {figures['opengl']}", figures, number=number)
 
@@ -142,12 +142,11 @@ def display(context: StepContext) -> StepOutcome:
         figures["refresh_hz"] = MS_PER_S / timing.period_ms
     if timing.modes_hz:
         figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
-    paced = (
-        ""
-        if timing.paced_by_screen
-        else "; the display has no refresh of its own, frames are paced by software"
-    )
-    forced = "".join(f"; forced: {each}" for each in context.source.forced)
+    if timing.paced_by_screen:
+        paced = ""
+    else:
+        paced = "; the display has no refresh of its own, frames are paced by software"
+    forced = "".join(f"; forced: {forced_check}" for forced_check in context.source.forced)
     line = f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}"
     number = StepNumber(
         timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next"
@@ -207,7 +206,9 @@ class Progress:
     """
 
     def __init__(self, tell: Callable[[str], object]) -> None:
-        self._tell, self._stage, self._images = tell, "", 0
+        self._tell = tell
+        self._stage = ""
+        self._images = 0
 
     def shows(self, pattern: Pattern) -> None:
         """A pattern is shown, and its image taken."""
@@ -221,8 +222,10 @@ class Progress:
     @contextmanager
     def of(self, step: str) -> Iterator[None]:
         """Tell of a step while this is open."""
-        self._stage, self._images = "begins", 0
-        begun_s, ended = time.monotonic(), threading.Event()
+        self._stage = "begins"
+        self._images = 0
+        begun_s = time.monotonic()
+        ended = threading.Event()
 
         def tell() -> None:
             while not ended.wait(PROGRESS_S):
@@ -259,26 +262,27 @@ class FirstLightSession:
         frames: int = 0,
         progress: Callable[[str], object] = lambda line: None,
     ) -> None:
-        self._watch, self._watched_s, self._frames, self._progress = (
-            watch,
-            watched_s,
-            frames,
-            Progress(progress),
-        )
-        self.folder, self.file, self.source, self.patches = folder, file, source, patches
+        self._watch = watch
+        self._watched_s = watched_s
+        self._frames = frames
+        self._progress = Progress(progress)
+        self.folder = folder
+        self.file = file
+        self.source = source
+        self.patches = patches
         bench = str(file.path.resolve())
-        found = read_session(folder)
-        if found is not None and found.bench != bench:
+        earlier = read_session(folder)
+        if earlier is not None and earlier.bench != bench:
             raise InputError(
-                f"{folder}: is the session of {found.bench}; write another directory for"
+                f"{folder}: is the session of {earlier.bench}; write another directory for"
                 f" {file.path}"
             )
         self.records = (
             {}
-            if found is None
-            else {record.name: record for record in found.steps if record.name in NAMES}
+            if earlier is None
+            else {record.name: record for record in earlier.steps if record.name in NAMES}
         )
-        self.unfinished = {} if found is None else dict(found.unfinished)
+        self.unfinished = {} if earlier is None else dict(earlier.unfinished)
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
         """Run what is not done; exit code 0, 1 where a step failed, or a MachineError's. Raises
@@ -337,7 +341,9 @@ class FirstLightSession:
         return None
 
     def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> StepRecord:
-        step, start_s, exit_code = STEPS[number], time.monotonic(), 0
+        step = STEPS[number]
+        start_s = time.monotonic()
+        exit_code = 0
         unmet = self._unmet(step)
         if unmet is not None:
             outcome = StepOutcome("skipped", f"needs {unmet}, which is not done")
@@ -374,7 +380,10 @@ class FirstLightSession:
         except HilstarError as error:
             # Bad data for one step is not a wrong command: the session continues and ends with exit
             # code 1.
-            code = 1 if isinstance(error, InputError) else error.exit_code
+            if isinstance(error, InputError):
+                code = 1
+            else:
+                code = error.exit_code
             if not isinstance(error, NoImage | MachineError):
                 del self.unfinished[step.name]
             return StepOutcome("failed", one_line(str(error))), code
@@ -389,20 +398,19 @@ class FirstLightSession:
         attempts = self.folder / "images"
         number = sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
         folder = attempts / f"{step.name}-{number if goes_on and number else number + 1}"
-        known: dict[str, Figure] = {
-            f"{name}.{key}": value
-            for name, record in self.records.items()
-            if record.verdict == "done"
-            for key, value in record.figures.items()
-        }
-        kept = complete_images(folder)
+        known: dict[str, Figure] = {}
+        for name, record in self.records.items():
+            if record.verdict == "done":
+                for key, value in record.figures.items():
+                    known[f"{name}.{key}"] = value
+        images = complete_images(folder)
         return StepContext(
             self.file,
             self.folder,
             folder,
             self.source,
             known,
-            kept,
+            images,
             self.patches,
             watch=self._shows,
             stage=self._progress.stage,
@@ -421,22 +429,26 @@ class FirstLightSession:
         step = STEPS[number]
         later = {key for other in STEPS[number + 1 :] for key in other.writes}
         config = msgspec.to_builtins(self.file.config)
-        kept = {
-            table: {
+        keys_by_table = {}
+        for table in tables or step.tables:
+            keys_by_table[table] = {
                 key: value for key, value in config[table].items() if f"{table}.{key}" not in later
             }
-            for table in tables or step.tables
-        }
-        named = {
-            text: sha256_of(self.file.folder / text)
-            for text in _texts(kept)
-            if _is_file(self.file.folder / text)
-        }
+        named = {}
+        for text in _texts(keys_by_table):
+            if _is_file(self.file.folder / text):
+                named[text] = sha256_of(self.file.folder / text)
         monitor = self.source.monitor
-        shown_on = f" on {monitor.name()}" if monitor is not None and monitor.edid_sha256 else ""
-        seen_by = self.source.identity + shown_on if step.tables else platform.python_version()
+        if monitor is not None and monitor.edid_sha256:
+            shown_on = f" on {monitor.name()}"
+        else:
+            shown_on = ""
+        if step.tables:
+            seen_by = self.source.identity + shown_on
+        else:
+            seen_by = platform.python_version()
         return hashlib.sha256(
-            msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")
+            msgspec.json.encode([__version__, seen_by, keys_by_table, named], order="sorted")
         ).hexdigest()
 
     def as_file(self, running: str | None = None) -> SessionFile:
@@ -460,7 +472,8 @@ class FirstLightSession:
         """
         record = self.records.get("display")
         figures = {} if record is None else record.figures
-        refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
+        refresh_hz = figures.get("refresh_hz")
+        modes = str(figures.get("modes_hz", "")).split()
         return beat_of(
             self.file.config,
             None if refresh_hz is None else float(refresh_hz),
@@ -473,7 +486,9 @@ def _finite(value: Figure) -> Figure:
     if not isinstance(value, float):
         return value
     # msgspec does not encode NumPy's floats
-    return float(value) if math.isfinite(value) else "not known"
+    if math.isfinite(value):
+        return float(value)
+    return "not known"
 
 
 def _texts(value: Any) -> Iterator[str]:

@@ -60,41 +60,42 @@ def verify(context: StepContext) -> StepOutcome:
     """Show stars with the calibrated bench, compare them with the sky, and run the twin. Raises
     InputError.
     """
-    seen = _enough_frames(context)
-    off_px = np.hypot(*seen.residual_px.T)
+    stars_seen = _enough_frames(context)
+    off_px = np.hypot(*stars_seen.residual_px.T)
     rms_px = float(np.sqrt((off_px**2).mean()))
     figures: dict[str, Figure] = {
         "stars": len(off_px),
-        "lost": seen.lost,
+        "lost": stars_seen.lost,
         "star_rms_px": rms_px,
         "star_p95_px": float(np.percentile(off_px, 95)),
         "star_max_px": float(off_px.max()),
         "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / context.geometry().tracker.focal_length_px,
-        "star_noise_px": math.sqrt(2) * float(np.sqrt((seen.place_noise_px**2).mean())),
-        "star_beyond_noise_p95_px": P95_OF_TWO * seen.beyond_px.sigma,
-        "star_beyond_noise_max_px": P95_OF_TWO * seen.beyond_px.high,
-        "frames": seen.frames,
+        "star_noise_px": math.sqrt(2) * float(np.sqrt((stars_seen.place_noise_px**2).mean())),
+        "star_beyond_noise_p95_px": P95_OF_TWO * stars_seen.beyond_px.sigma,
+        "star_beyond_noise_max_px": P95_OF_TWO * stars_seen.beyond_px.high,
+        "frames": stars_seen.frames,
     }
     reasons: list[str] = []
-    picture, light = context.session / "verify.svg", context.session / "verify-light.svg"
+    picture = context.session / "verify.svg"
+    light = context.session / "verify-light.svg"
     rms = f"{figures['star_rms_px']:.3f} px ({figures['star_rms_arcsec']:.2f} arcsec) rms"
     width_px = context.file.config.tracker.resolution_px[0]
     draw_residuals(
         picture,
-        seen.place_px,
-        seen.residual_px,
+        stars_seen.place_px,
+        stars_seen.residual_px,
         width_px,
-        f"{len(seen.place_px)} stars are {rms} from the sky",
+        f"{len(stars_seen.place_px)} stars are {rms} from the sky",
     )
     line = (
-        f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them,"
-        f" {noise_words(seen)}"
+        f"{len(stars_seen.place_px)} stars on the screen are {rms} from where the sky has them,"
+        f" {noise_words(stars_seen)}"
     )
     line += f"; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
     pictures = [picture]
-    if seen.sure.sum() >= MIN_STARS:
-        found, finding = _light_figures(context, seen, light)
-        figures |= found
+    if stars_seen.sure.sum() >= MIN_STARS:
+        light_figures, finding = _light_figures(context, stars_seen, light)
+        figures |= light_figures
         pictures.append(light)
         line += (
             f", and {figures['flux_p95_mag']:.3f} mag from its light (95 % of"
@@ -102,9 +103,9 @@ def verify(context: StepContext) -> StepOutcome:
         )
         reasons += [finding] if finding else []
     else:
-        line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
+        line += f"; the light of {int(stars_seen.sure.sum())} can be read, too few to judge it"
     is_scattered = bool(reasons)
-    reasons += place_reasons(seen, context.file.config.verify.centroid_px)
+    reasons += place_reasons(stars_seen, context.file.config.verify.centroid_px)
     reasons += _star_reasons(context, figures, is_scattered=is_scattered)
     context.stage(f"the twin looks at {VERIFY_FIELDS} fields")
     twin = summarise(_twin(context))
@@ -135,7 +136,7 @@ def verify(context: StepContext) -> StepOutcome:
         f"rms distance of {len(off_px)} stars from where the sky has them",
     )
     return StepOutcome(
-        verdict, line, figures, (*pictures, *seen.images), tuple(pictures), number=number
+        verdict, line, figures, (*pictures, *stars_seen.images), tuple(pictures), number=number
     )
 
 
@@ -154,10 +155,10 @@ def _enough_frames(context: StepContext) -> StarsSeen:
     """The stars of as many frames as it takes to tell their places from noise, or as many as
     were asked for.
     """
-    seen = see_stars(context, context.frames or 1)
-    wanted = frames_for(seen, context.file.config.verify.centroid_px)
+    stars_seen = see_stars(context, context.frames or 1)
+    wanted = frames_for(stars_seen, context.file.config.verify.centroid_px)
     if context.frames or context.source.by_hand or not 1 < wanted <= MAX_FRAMES:
-        return seen
+        return stars_seen
     return see_stars(context, wanted)
 
 
@@ -165,7 +166,8 @@ def frames_for(seen: StarsSeen, limit_px: float) -> int:
     """How many frames would tell whether the stars' places are within the limit at 95 %; those
     seen where they tell it.
     """
-    beyond, limit = seen.beyond_px, limit_px / P95_OF_TWO
+    beyond = seen.beyond_px
+    limit = limit_px / P95_OF_TWO
     if beyond.high <= limit or beyond.low > limit:
         return seen.frames
     room = limit**2 - beyond.sigma**2
@@ -178,7 +180,8 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
     noise that hides it.
     """
     beyond = seen.beyond_px
-    at_least, at_most = P95_OF_TWO * beyond.low, P95_OF_TWO * beyond.high
+    at_least = P95_OF_TWO * beyond.low
+    at_most = P95_OF_TWO * beyond.high
     if at_least > limit_px:
         off = (
             f"beyond their noise stars are {P95_OF_TWO * beyond.sigma:.3f} px off at 95 % (limit"
@@ -204,12 +207,14 @@ def _twin(context: StepContext) -> TwinVerdict:
     """The twin's verdict; its black level is judged no closer than the session knows the light
     of white, by which it glows.
     """
-    found = run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
-    glow = found.measured.glow
+    twin_run = run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
+    glow = twin_run.measured.glow
     known = float(context.known.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
     limit = max(glow.limit_e_per_s_px, AGREE_SIGMAS * known * glow.assumed_e_per_s_px)
     return judge(
-        dataclasses.replace(found.measured, glow=dataclasses.replace(glow, limit_e_per_s_px=limit))
+        dataclasses.replace(
+            twin_run.measured, glow=dataclasses.replace(glow, limit_e_per_s_px=limit)
+        )
     )
 
 
@@ -217,14 +222,13 @@ def _twin_file(context: StepContext) -> BenchFile:
     """The bench file for the twin; in a virtual session with the truth's calibration and
     geometry as true.
     """
-    truth, file = context.truth, context.file
+    truth = context.truth
+    file = context.file
     if truth is None:
         return file
-    monitor, collimator, folder = (
-        truth.config.monitor,
-        truth.config.collimator,
-        truth.folder.resolve(),
-    )
+    monitor = truth.config.monitor
+    collimator = truth.config.collimator
+    folder = truth.folder.resolve()
     limits = {name: getattr(file.config.verify, name) for name in LIMITS}
     known = Verify(
         **limits,
@@ -249,7 +253,8 @@ def _light_figures(
     """The errors of the stars' light without their common zero point, and what is wrong where
     they scatter too far.
     """
-    gain, exposure_s = context.file.config.tracker.detector.gain_e_per_dn, context.exposure_s
+    gain = context.file.config.tracker.detector.gain_e_per_dn
+    exposure_s = context.exposure_s
     off = np.asarray(magnitude(seen.dn * gain / (seen.e_per_s * exposure_s)))[seen.sure]
     zero_point = float(np.median(off))
     spread = np.abs(off - zero_point)
@@ -285,9 +290,10 @@ def _star_reasons(
     """The limits of [verify] that the stars miss, with advice; not their light again where its
     scatter has been told.
     """
-    limits, found = context.file.config.verify, []
+    limits = context.file.config.verify
+    reasons = []
     if float(figures["lost"]) > LOST_SHARE * (float(figures["lost"]) + float(figures["stars"])):
-        found.append(f"{figures['lost']} bright stars are not there")
+        reasons.append(f"{figures['lost']} bright stars are not there")
     is_off = float(figures.get("flux_beyond_noise_p95_mag", 0.0)) > limits.flux_mag
     if is_off and not is_scattered:
         off = (
@@ -295,14 +301,14 @@ def _star_reasons(
             " at 95 %"
         )
         off += f" (limit {limits.flux_mag:g})"
-        found.append(f"{off}: measure the response (photometry)")
+        reasons.append(f"{off}: measure the response (photometry)")
     if abs(float(figures.get("flux_zero_point_mag", 0.0))) > limits.flux_mag:
         off = (
             f"all stars are {figures['flux_zero_point_mag']:+.3f} mag off (limit"
             f" {limits.flux_mag:g})"
         )
-        found.append(f"{off}: measure what white is worth (scale)")
-    return found
+        reasons.append(f"{off}: measure what white is worth (scale)")
+    return reasons
 
 
 def _against_truth(context: StepContext) -> dict[str, Figure]:
@@ -328,7 +334,8 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
             "no place of the screen has a direction both in the bench file and in the truth; look"
             " at the truth"
         )
-    rms, largest = float(np.sqrt((off[known] ** 2).mean())), float(off[known].max())
+    rms = float(np.sqrt((off[known] ** 2).mean()))
+    largest = float(off[known].max())
     return {
         "truth_rms_arcsec": rms,
         "truth_max_arcsec": largest,
@@ -338,35 +345,35 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
 
 def scale(context: StepContext) -> StepOutcome:
     """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
-    seen = see_stars(context)
+    stars_seen = see_stars(context)
     white = _white_e_per_s(context.file)
     drawn = display_psf(context.file.config, context.file.folder, context.geometry().monitor)
-    clips = seen.e_per_s * drawn.peak_share > white
-    used = (seen.noise_mag < READ_MAG) & ~clips
+    clips = stars_seen.e_per_s * drawn.peak_share > white
+    used = (stars_seen.noise_mag < READ_MAG) & ~clips
     if used.sum() < MIN_STARS:
-        saturated = int(np.isinf(seen.noise_mag).sum())
+        saturated = int(np.isinf(stars_seen.noise_mag).sum())
         raise InputError(
             f"the light of {used.sum()} stars can be read and {MIN_STARS} are needed; of"
             f" {len(used)}, {saturated} saturate the tracker (a shorter [tracker] exposure_s) and"
             f" {int(clips.sum())} clip on the monitor (a smaller [render] brightest_v_mag)"
         )
-    wanted, noise_mag = seen.e_per_s[used], seen.noise_mag[used]
+    wanted, noise_mag = stars_seen.e_per_s[used], stars_seen.noise_mag[used]
     ratios = (
-        seen.dn[used]
+        stars_seen.dn[used]
         * context.file.config.tracker.detector.gain_e_per_dn
         / (wanted * context.exposure_s)
     )
     found = scale_of(white, ratios, noise_mag)
-    scatter = seen.scatter(np.asarray(magnitude(ratios)), used)
+    scatter = stars_seen.scatter(np.asarray(magnitude(ratios)), used)
     by_mag = float(magnitude(found.flux_at_white_e_per_s / white))
     # The ADC rounds all stars by where its one dark level is.
-    rounding_mag = found.weights @ seen.rounding_mag[used] / found.weights.sum()
+    rounding_mag = found.weights @ stars_seen.rounding_mag[used] / found.weights.sum()
     rounding_rms_mag = float(np.sqrt((rounding_mag**2).mean()))
     by_readings_mag = MAG_PER_RELATIVE * (found.relative_error or 0.0)
     error_mag = math.hypot(by_readings_mag, SYSTEMATIC_MAG, rounding_rms_mag)
     weight = np.sqrt(found.weights)
     trend_mag, trend_error_mag = trend(wanted, np.asarray(magnitude(ratios)), weight)
-    rounding_trends_mag = [trend(wanted, one, weight)[0] for one in seen.rounding_mag[used].T]
+    rounding_trends_mag = [trend(wanted, one, weight)[0] for one in stars_seen.rounding_mag[used].T]
     rounding_trend_mag = float(np.sqrt(np.mean(np.square(rounding_trends_mag))))
     trend_error_mag = math.hypot(trend_error_mag, rounding_trend_mag)
     figures: dict[str, Figure] = {
@@ -400,13 +407,16 @@ def scale(context: StepContext) -> StepOutcome:
         f"{line}; they agree to {found.scatter_mag:.3f} mag",
     )
     readings = context.session / READINGS_FILE
-    sigma_dn = noise_mag / MAG_PER_RELATIVE * seen.dn[used]
+    sigma_dn = noise_mag / MAG_PER_RELATIVE * stars_seen.dn[used]
     write_csv(
         readings,
         ("hip", "dn", "sigma_dn"),
-        zip(*(each.tolist() for each in (seen.hip[used], seen.dn[used], sigma_dn)), strict=True),
+        zip(
+            *(column.tolist() for column in (stars_seen.hip[used], stars_seen.dn[used], sigma_dn)),
+            strict=True,
+        ),
     )
-    files = (picture, readings, *seen.images)
+    files = (picture, readings, *stars_seen.images)
     error_e_per_s = found.flux_at_white_e_per_s * error_mag / MAG_PER_RELATIVE
     number = StepNumber(
         found.flux_at_white_e_per_s,
@@ -468,13 +478,15 @@ def trend(
     along = np.log(e_per_s)
     weight = np.broadcast_to(np.asarray(weight, dtype=np.float64), along.shape)
     share = weight**2 / (weight**2).sum()
-    x, left = along - float(share @ along), off_mag - float(share @ off_mag)
-    leverage, span = float((share * x**2).sum()), float(np.ptp(along))
+    x = along - float(share @ along)
+    centred_mag = off_mag - float(share @ off_mag)
+    leverage = float((share * x**2).sum())
+    span = float(np.ptp(along))
     if leverage <= 0:
         return 0.0, 0.0
-    slope = float((share * x * left).sum()) / leverage
-    left = left - slope * x
-    variance = float((share * left**2).sum()) * len(x) / max(len(x) - 2, 1)
+    slope = float((share * x * centred_mag).sum()) / leverage
+    centred_mag = centred_mag - slope * x
+    variance = float((share * centred_mag**2).sum()) * len(x) / max(len(x) - 2, 1)
     alike = 1 / float((share**2).sum())
     return slope * span, math.sqrt(variance / (alike * leverage)) * span
 

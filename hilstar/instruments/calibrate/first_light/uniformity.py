@@ -233,20 +233,23 @@ def warm_up(context: StepContext) -> StepOutcome:
         lambda seconds: context.source.hold(file, hold, seconds),
         context.watched_s,
     )
-    found, ended_s = judge_warm_up(t_s, light), context.source.clock_ns() / NS_PER_S
+    judged, ended_s = judge_warm_up(t_s, light), context.source.clock_ns() / NS_PER_S
     table, picture = context.session / "warm-up.csv", context.session / "warm-up.svg"
     write_csv(table, ("t_s", "light_dn"), zip(t_s.tolist(), light.tolist(), strict=True))
-    with chart(picture, found.line) as (axes,):
+    with chart(picture, judged.line) as (axes,):
         axes.plot(t_s / 60, 100 * light / light[-1], ".", color=MUTED, markersize=4)
         axes.plot(
-            t_s / 60, 100 * fitted_white(found, t_s, light) / light[-1], color=BLUE, label=found.law
+            t_s / 60,
+            100 * fitted_white(judged, t_s, light) / light[-1],
+            color=BLUE,
+            label=judged.law,
         )
         axes.set(xlabel="time [min]", ylabel="white over the last reading [%]")
         label_ends(axes)
     figures: dict[str, Figure] = {
-        name: value for name, value in asdict(found).items() if name != "is_stable"
+        name: value for name, value in asdict(judged).items() if name != "is_stable"
     }
-    figures |= {"readings": len(light), "stable": "yes" if found.is_stable else "no"}
+    figures |= {"readings": len(light), "stable": "yes" if judged.is_stable else "no"}
     if context.truth is not None:
         virtual = context.truth.config.certify.virtual
         tau_s, change = 60 * virtual.warm_up_min, virtual.cold_percent / 100
@@ -256,29 +259,29 @@ def warm_up(context: StepContext) -> StepOutcome:
         )
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
         stable_s = tau_s * math.log(
-            max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit
+            max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / judged.limit
         )
         # by its exponential alone
         figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)
     changes = (
-        context.change("certify", "warm_up_percent", float(f"{100 * found.bound:.3g}"))
-        if found.is_stable
+        context.change("certify", "warm_up_percent", float(f"{100 * judged.bound:.3g}"))
+        if judged.is_stable
         else ()
     )
     per_h = StepNumber(
-        found.drift_percent_per_h,
-        found.drift_error_percent_per_h,
+        judged.drift_percent_per_h,
+        judged.drift_error_percent_per_h,
         "%/h",
         "drift of white at the last reading",
     )
     return StepOutcome(
-        "done" if found.is_stable else "failed",
-        found.line if found.is_stable else f"{found.line}; {found.cure}",
+        "done" if judged.is_stable else "failed",
+        judged.line if judged.is_stable else f"{judged.line}; {judged.cure}",
         figures,
         (table, picture),
         (picture,),
         changes,
-        number=per_h if found.law != "none" else None,
+        number=per_h if judged.law != "none" else None,
     )
 
 
@@ -327,12 +330,12 @@ def _said(found: UniformityMap, assumed: bool) -> str:
 def _figures(
     context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap
 ) -> dict[str, Figure]:
-    seen = found.at_dots[found.used]
+    seen_light = found.at_dots[found.used]
     figures: dict[str, Figure] = {
         "dots": len(dots.light),
         "wild_dots": int((~found.used).sum()),
         "grid": " x ".join(map(str, found.grid.shape)),
-        "darkest_of_brightest": float(seen.min() / seen.max()),
+        "darkest_of_brightest": float(seen_light.min() / seen_light.max()),
         "change_rms_mag": found.rms_mag,
         "off_bench_file_rms_mag": against.rms_mag,
         "left_rms_mag": found.left_mag,
@@ -345,11 +348,10 @@ def _figures(
             monitor.resolution_px
         )
         if monitor.resolution_px == context.resolution_px:
-            its = (
-                np.ones(len(dots.light))
-                if true is None
-                else true[dots.y, dots.x].astype(np.float64)
-            )
+            if true is None:
+                its = np.ones(len(dots.light))
+            else:
+                its = true[dots.y, dots.x].astype(np.float64)
             figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))
     return figures
 
@@ -422,7 +424,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
 
 def _shown(firsts: list[int], period: int, code: int, resolution_px: tuple[int, int]) -> CodeImage:
     """Squares of DOT_PX about every `period`-th pixel from `firsts` (x, y) on."""
-    codes, half = black(resolution_px), DOT_PX // 2
+    codes = black(resolution_px)
+    half = DOT_PX // 2
     for down in range(-half, half + 1):
         for right in range(-half, half + 1):
             codes[firsts[1] + down :: period, firsts[0] + right :: period] = code
@@ -443,14 +446,18 @@ class LatticeSums:
     """
 
     def __init__(self, firsts: IntArray, period: int, reach: float, size: IntArray) -> None:
-        self._firsts, self._period, self._reach = firsts, period, reach
+        self._firsts = firsts
+        self._period = period
+        self._reach = reach
         self._counts = (size - firsts - DOT_PX // 2 - 1) // period + 1
         total = int(self._counts[0] * self._counts[1])
         self._light, self._pixels, self._bad = (np.zeros(total) for _ in range(3))
 
     def add(self, looked_at: FloatArray, image: FloatArray, bad: BoolArray) -> None:
         """Add pixels (n,) of the tracker, which look at places (2, n) on the monitor, px."""
-        firsts, counts, total = self._firsts, self._counts, len(self._light)
+        firsts = self._firsts
+        counts = self._counts
+        total = len(self._light)
         place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / self._period
         nearest = np.rint(place)
         inside = (nearest >= 0).all(axis=0) & (nearest[0] < counts[0]) & (nearest[1] < counts[1])
@@ -565,7 +572,8 @@ def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, in
 
     across = _two(weights_of_grid(resolution_px[0], shape[1])[dots.x])
     down = _two(weights_of_grid(resolution_px[1], shape[0])[dots.y])
-    dot, sides = np.arange(len(dots.x)), [(y, x) for y in down for x in across]
+    dot = np.arange(len(dots.x))
+    sides = [(y, x) for y in down for x in across]
     fields = np.concatenate([y[0] * shape[1] + x[0] for y, x in sides])
     weights = np.concatenate([y[1] * x[1] for y, x in sides])
     return csr_array(
@@ -577,9 +585,10 @@ def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
     """The one or two non-zero fields of each row of weights (n, fields): their numbers and
     weights, (n,) each.
     """
-    row, last = np.arange(len(weights)), weights.shape[1] - 1
-    left = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
-    return [(field, weights[row, field]) for field in (left, left + 1)[: last + 1]]
+    row = np.arange(len(weights))
+    last = weights.shape[1] - 1
+    lower_field = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
+    return [(field, weights[row, field]) for field in (lower_field, lower_field + 1)[: last + 1]]
 
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
@@ -587,17 +596,18 @@ def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArra
     neighbours.
     """
     normal = (design.T @ design).toarray() + _smoothness(shape)
-    found = np.linalg.solve(normal, design.T @ light)
+    solution = np.linalg.solve(normal, design.T @ light)
     # a field that no dot reaches has light, too
-    return np.asarray(np.maximum(found, light.min() / 2))
+    return np.asarray(np.maximum(solution, light.min() / 2))
 
 
 def _smoothness(shape: tuple[int, int]) -> FloatArray:
     """The penalty (fields, fields) on differences between neighbouring fields."""
     number = np.arange(math.prod(shape)).reshape(shape)
     penalty = np.zeros((number.size, number.size))
-    for one, other in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
-        a, b = one.ravel(), other.ravel()
+    for field_number, other in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
+        a = field_number.ravel()
+        b = other.ravel()
         np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
         np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
     return penalty
@@ -619,10 +629,11 @@ def _held_out(
 ) -> FloatArray:
     """The squared relative error of each dot (n,) in a map made without it."""
     squares = np.zeros(len(light))
-    for each in range(FOLDS):
-        out, kept = fold == each, used & (fold != each)
+    for fold_number in range(FOLDS):
+        out = fold == fold_number
+        is_fitted = used & (fold != fold_number)
         squares[out] = (
-            light[out] / (design[out] @ _fitted(light[kept], design[kept], shape)) - 1
+            light[out] / (design[out] @ _fitted(light[is_fitted], design[is_fitted], shape)) - 1
         ) ** 2
     return squares
 
@@ -632,8 +643,8 @@ def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: s
     the screen.
     """
     x, y, light, mapped = (
-        each[found.used]
-        for each in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots)
+        values[found.used]
+        for values in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots)
     )
     panels = {
         "fainter than the brightest place [mag]": np.asarray(magnitude(light / mapped.max())),

@@ -147,10 +147,12 @@ def calibrate_files(
             raise InputError(
                 f"{observed[1]}: one table is read; write all centroids into {observed[0]}"
             )
-        seen = read_observed(observed[0])
+        observed_dots = read_observed(observed[0])
     else:
-        seen = measure_images(observed, dark, config.tracker.resolution_px, dot_sigma_px(file))
-    return calibrate_seen(file, dots, seen, tracker_is_ideal=tracker_is_ideal)
+        observed_dots = measure_images(
+            observed, dark, config.tracker.resolution_px, dot_sigma_px(file)
+        )
+    return calibrate_seen(file, dots, observed_dots, tracker_is_ideal=tracker_is_ideal)
 
 
 def calibrate_seen(
@@ -177,10 +179,8 @@ def seen_screen_of(file: BenchFile) -> SeenScreen:
     about. Raises InputError.
     """
     tracker = tracker_camera(file.config.tracker, file.folder)
-    monitor, is_sure = (
-        bench_camera(file.config, file.folder),
-        file.config.collimator.geometry is not None,
-    )
+    monitor = bench_camera(file.config, file.folder)
+    is_sure = file.config.collimator.geometry is not None
     return SeenScreen(monitor, tracker, is_sure, psf_sigma_of(file))
 
 
@@ -272,7 +272,8 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     """The fit with its lens limited to the tracker's field, where part of the screen lies
     outside of it.
     """
-    geometry, monitor = fit.geometry, fit.geometry.monitor
+    geometry = fit.geometry
+    monitor = fit.geometry.monitor
     # By places over the whole screen, not by the dots: those stand where the tracker sees it.
     sides = (np.linspace(-0.5, size - 0.5, SCREEN_PLACES) for size in monitor.resolution_px)
     x_px, y_px = (part.ravel() for part in np.meshgrid(*sides))
@@ -340,17 +341,18 @@ def _in_view(
     geometry = fit.geometry
     directions = geometry.monitor.rays(x_px, y_px)
     width, height = geometry.tracker.resolution_px
-    found = []
+    in_view = []
     for q in geometry.q_poses:
         x, y = geometry.tracker.project(directions @ to_matrix(q).T)
         across = (x > edge_px) & (x < width - 1 - edge_px)
-        found.append(across & (y > edge_px) & (y < height - 1 - edge_px))
-    return found
+        in_view.append(across & (y > edge_px) & (y < height - 1 - edge_px))
+    return in_view
 
 
 def _refuse_gaps(calibrated: Calibrated) -> None:
     """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
-    plan, problem = calibrated.plan, calibrated.problem
+    plan = calibrated.plan
+    problem = calibrated.problem
     wanted = np.any(calibrated.measurable, axis=0)
     found = np.zeros(len(plan), dtype=bool)
     found[np.unique(calibrated.data.dot)] = True
@@ -363,7 +365,10 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
         for c, sideways in enumerate(CELLS[0]):
             here = (column == c) & (row == r) & wanted
             if here.sum() >= MIN_CELL_DOTS and found[here].sum() < MIN_CELL_SHARE * here.sum():
-                part = "middle" if vertical == sideways else f"{vertical} {sideways}"
+                if vertical == sideways:
+                    part = "middle"
+                else:
+                    part = f"{vertical} {sideways}"
                 raise InputError(
                     f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part}"
                     " of the screen: look for what covers or dims it, and take new frames"
@@ -381,7 +386,8 @@ def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
     """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its
     own lens.
     """
-    chosen, error = found.chosen, found.uncertainty
+    chosen = found.chosen
+    error = found.uncertainty
     return {
         "model": chosen.name,
         "poses": len(found.problem.q_poses),
@@ -397,7 +403,9 @@ def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
         "held_out": {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec},
         "error": _both(error),
         "models": [{"name": model.name, **_both(model)} for model in found.models],
-        "parameters": {name: each._asdict() for name, each in parameters_of(found).items()},
+        "parameters": {
+            name: parameter._asdict() for name, parameter in parameters_of(found).items()
+        },
         "tracker": "held" if found.tracker_known else "fitted",
         "notes": notes_for_a_person(found),
         "written": written,
@@ -428,9 +436,11 @@ def notes_for_a_person(found: Calibrated) -> tuple[str, ...]:
 
 def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     """Each parameter's value and one sigma, in its own unit."""
-    monitor, sigma = found.fit.geometry.monitor, found.uncertainty.sigma
+    monitor = found.fit.geometry.monitor
+    sigma = found.uncertainty.sigma
     lens = monitor.lens or Lens()
-    focal, pitch = monitor.focal_length_px, ARCSEC_PER_RAD
+    focal = monitor.focal_length_px
+    pitch = ARCSEC_PER_RAD
     values = {
         "focal_length_px": (focal, focal * sigma.get("log_focal", 0.0)),
         "principal_point_x_px": (monitor.principal_point_px[0], sigma.get("centre_x", 0.0)),
@@ -458,7 +468,9 @@ def write_calibrated(
     """Write the geometry file with its errors and its monitor, and its chart if `plot`; their
     names. Raises InputError.
     """
-    geometry, chosen, uncertainty = found.fit.geometry, found.chosen, found.uncertainty
+    geometry = found.fit.geometry
+    chosen = found.chosen
+    uncertainty = found.uncertainty
     error = ErrorTable(
         model=chosen.name,
         held_out_rms_arcsec=chosen.rms_arcsec,
@@ -484,12 +496,14 @@ def write_calibrated(
     )
     if plot is not None:
         draw_geometry(plot, found)
-    return [str(each) for each in (path, plot) if each is not None]
+    return [str(written_path) for written_path in (path, plot) if written_path is not None]
 
 
 def lines_of(found: Calibrated) -> list[str]:
     """The calibration as lines of text."""
-    chosen, error, noise = found.chosen, found.uncertainty, found.held_out_noise_arcsec
+    chosen = found.chosen
+    error = found.uncertainty
+    noise = found.held_out_noise_arcsec
     rows = [
         (
             "dots",
@@ -545,7 +559,8 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
             image, ax=[places, residuals], label="1 sigma of a star's place [arcsec]", shrink=0.5
         )
         places.set_title("Error of a star's place")
-        x, y = found.plan.x_px[dot], found.plan.y_px[dot]
+        x = found.plan.x_px[dot]
+        y = found.plan.y_px[dot]
         look = {"angles": "xy", "scale_units": "xy", "width": 0.002, "color": BLUE}
         arrows = residuals.quiver(x, y, right, down, scale=median / (ARROW_SHARE * width), **look)
         key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}

@@ -197,13 +197,13 @@ class SeenScreen:
         )
         of_screen = np.stack([part.ravel() for part in np.meshgrid(screen_x, screen_y)], axis=1)
         places = np.concatenate([of_field[np.isfinite(of_field).all(axis=1)], of_screen])
-        seen = places[self.shows(*places.T)]
-        if not len(seen):
+        visible_px = places[self.shows(*places.T)]
+        if not len(visible_px):
             raise InputError(
                 "the tracker sees no place of the screen: look at [collimator] q_cam_to_mon, focal"
                 " lengths and pixel pitches"
             )
-        return seen.min(axis=0), seen.max(axis=0)
+        return visible_px.min(axis=0), visible_px.max(axis=0)
 
 
 def lit_for(seen: SeenScreen) -> int:
@@ -352,7 +352,10 @@ def read_plan(path: Path) -> DotPlan:
     rows: list[tuple[int, int, float, float]] = []
     for line, cells in read_rows(path, PLAN_COLUMNS, PLAN_ADVICE, MAX_PLAN_BYTES, ()):
         try:
-            frame, dot, x, y = int(cells[0]), int(cells[1]), float(cells[2]), float(cells[3])
+            frame = int(cells[0])
+            dot = int(cells[1])
+            x = float(cells[2])
+            y = float(cells[3])
             if min(frame, dot) < 0 or max(frame, dot) > 10**6:
                 raise ValueError
         except ValueError as error:
@@ -362,7 +365,8 @@ def read_plan(path: Path) -> DotPlan:
     if not rows:
         raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
     place = {dot: k for k, dot in enumerate(sorted({dot for _, dot, _, _ in rows}))}
-    x_px, y_px = np.full(len(place), np.nan), np.full(len(place), np.nan)
+    x_px = np.full(len(place), np.nan)
+    y_px = np.full(len(place), np.nan)
     lit = np.zeros((len(place), max(frame for frame, *_ in rows) + 1), dtype=bool)
     for frame, dot, x, y in rows:
         k = place[dot]

@@ -133,22 +133,20 @@ def geometry_of(
         to_matrix(q),
         lens if "k1" in model.names else None,
     )
-    tracker, rest = nominal.tracker, numbers[len(model.names) :]
+    tracker = nominal.tracker
+    rest = numbers[len(model.names) :]
     if model.tracker_names:
-        own = {
+        lens_values = {
             name: TRACKER_STEPS[name] * float(n)
             for name, n in zip(model.tracker_names, rest, strict=False)
         }
-        radial, tangential = (
-            (own["tracker_k1"], own["tracker_k2"], 0.0),
-            (own["tracker_p1"], own["tracker_p2"]),
-        )
+        radial = (lens_values["tracker_k1"], lens_values["tracker_k2"], 0.0)
+        tangential = (lens_values["tracker_p1"], lens_values["tracker_p2"])
         tracker = replace(tracker, lens=Lens(radial, tangential))
     steps = POSE_STEP_RAD * rest[len(model.tracker_names) :].reshape(-1, 3)
-    turned = [
-        multiply(from_rotation_vector(step), pose)
-        for step, pose in zip(steps, q_poses[1:], strict=True)
-    ]
+    turned = []
+    for step, pose in zip(steps, q_poses[1:], strict=True):
+        turned.append(multiply(from_rotation_vector(step), pose))
     return Geometry(monitor, q, tracker, np.array([q_poses[0], *turned]))
 
 
@@ -220,7 +218,8 @@ class _Loss:
     data: MatchedDots
 
     def geometry(self, numbers: FloatArray) -> Geometry:
-        lens, field = numbers[: self.model.size], numbers[self.model.size :]
+        lens = numbers[: self.model.size]
+        field = numbers[self.model.size :]
         geometry = geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens)
         if not self.field_degree:
             return geometry
@@ -244,29 +243,37 @@ class _Loss:
         For the lens they are finite differences without the field, which hardly changes along a
         step; the field is linear.
         """
-        lens, own = (
-            numbers[: self.model.size],
-            len(self.model.names) + len(self.model.tracker_names),
-        )
-        poses = (len(lens) - own) // 3
+        lens = numbers[: self.model.size]
+        pose_numbers = len(self.model.names) + len(self.model.tracker_names)
+        poses = (len(lens) - pose_numbers) // 3
         # A pose turns its own centroids alone: one trial turns all poses about one axis.
-        turns = np.hstack([np.zeros((3, own)), np.tile(np.eye(3), (1, poses))])[: 3 * poses]
-        steps = DIFFERENCE * np.vstack([np.eye(own, len(lens)), turns])
+        turns = np.hstack([np.zeros((3, pose_numbers)), np.tile(np.eye(3), (1, poses))])[
+            : 3 * poses
+        ]
+        steps = DIFFERENCE * np.vstack([np.eye(pose_numbers, len(lens)), turns])
         bare, *varied = (
             geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens + n)
             for n in (0 * lens, *steps)
         )
-        seen = self.data.seen
+        seen_dots = self.data.seen
         # the same for all terms of the monitor's camera
-        directions = directions_in_cam(bare, seen.pose, seen.x_px, seen.y_px)
-        base = self._off(bare, directions) if self.field_degree else off
+        directions = directions_in_cam(bare, seen_dots.pose, seen_dots.x_px, seen_dots.y_px)
+        if self.field_degree:
+            base = self._off(bare, directions)
+        else:
+            base = off
         offs = [
             self._off(g, directions if n < len(self.model.names) else None)
             for n, g in enumerate(varied)
         ]
         slope = np.stack([(trial - base) / DIFFERENCE for trial in offs], axis=1)
-        is_its = np.tile(seen.pose, 2)[:, None] == np.repeat(np.arange(1, poses + 1), 3)
-        columns = np.hstack([slope[:, :own], np.where(is_its, np.tile(slope[:, own:], poses), 0.0)])
+        is_its = np.tile(seen_dots.pose, 2)[:, None] == np.repeat(np.arange(1, poses + 1), 3)
+        columns = np.hstack(
+            [
+                slope[:, :pose_numbers],
+                np.where(is_its, np.tile(slope[:, pose_numbers:], poses), 0.0),
+            ]
+        )
         if not self.field_degree:
             return columns
         terms = np.nan_to_num(
@@ -276,7 +283,9 @@ class _Loss:
                 self.field_degree,
             )
         )
-        terms /= (self.problem.monitor_px_per_px * seen.sigma_px * self.problem.noise_px)[:, None]
+        terms /= (self.problem.monitor_px_per_px * seen_dots.sigma_px * self.problem.noise_px)[
+            :, None
+        ]
         return np.hstack([columns, _blocks(terms)])
 
     def prior(self, count: int) -> FloatArray:
@@ -287,8 +296,8 @@ class _Loss:
 
     def value(self, off: FloatArray, numbers: FloatArray) -> float:
         size = np.abs(off)
-        each = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
-        return float(each.sum() + 0.5 * self.prior(len(numbers)) @ numbers**2)
+        losses = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
+        return float(losses.sum() + 0.5 * self.prior(len(numbers)) @ numbers**2)
 
 
 def fit(
@@ -314,7 +323,8 @@ def fit(
 def _smallest(loss: _Loss, numbers: FloatArray, min_gain: float) -> FloatArray:
     """The numbers with the smallest loss (Levenberg and Marquardt, reweighted)."""
     prior = loss.prior(len(numbers))
-    off, damping = loss.residuals(numbers), FIRST_DAMPING
+    off = loss.residuals(numbers)
+    damping = FIRST_DAMPING
     value = loss.value(off, numbers)
     for _ in range(MAX_STEPS):
         slopes = loss.slopes(numbers, off)
@@ -331,12 +341,10 @@ def _smallest(loss: _Loss, numbers: FloatArray, min_gain: float) -> FloatArray:
         else:
             return numbers
         gain = value - new_value
-        numbers, off, value, damping = (
-            numbers + step,
-            new_off,
-            new_value,
-            max(damping / 10, MIN_DAMPING),
-        )
+        numbers = numbers + step
+        off = new_off
+        value = new_value
+        damping = max(damping / 10, MIN_DAMPING)
         if gain <= min_gain * max(1.0, 2 * value / len(off)):
             break
     return numbers
@@ -350,7 +358,8 @@ def residuals_px(
 
     `directions` (n, 3) are the centroids' `directions_in_cam` where they are known.
     """
-    plan, scale = problem.plan, problem.monitor_px_per_px
+    plan = problem.plan
+    scale = problem.monitor_px_per_px
     x_px, y_px = _places_px(geometry, data, directions)
     return (x_px - plan.x_px[data.dot]) / scale, (y_px - plan.y_px[data.dot]) / scale
 
@@ -435,17 +444,22 @@ def candidates(
     wanted += [
         (f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES
     ]
-    found: list[Candidate] = []
+    candidate_models: list[Candidate] = []
     for name, names, degree in wanted:
         model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
         numbers = model.size + (degree + 1) * (degree + 2)
         # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers
         # followed 42 dots' own errors.
         if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers:
-            found.append(held_out(problem, name, model, degree, data))
-        if len(found) > 4 and found[-1].rms_arcsec > found[-2].rms_arcsec > found[-3].rms_arcsec:
+            candidate_models.append(held_out(problem, name, model, degree, data))
+        if (
+            len(candidate_models) > 4
+            and candidate_models[-1].rms_arcsec
+            > candidate_models[-2].rms_arcsec
+            > candidate_models[-3].rms_arcsec
+        ):
             break  # larger fields only follow the noise
-    return found
+    return candidate_models
 
 
 def held_out(
@@ -489,7 +503,7 @@ def _is_beyond_chance(smaller: Candidate, larger: Candidate) -> bool:
     """Whether the larger model's gain on the held-out dots is more than the dots' scatter makes
     by chance.
     """
-    squares = [(each.off_arcsec**2).sum(axis=1) for each in (smaller, larger)]
+    squares = [(model_fit.off_arcsec**2).sum(axis=1) for model_fit in (smaller, larger)]
     with np.errstate(invalid="ignore"):  # a dot that both put behind the lens
         gain = np.nan_to_num(squares[0] - squares[1], nan=0.0)
     # A dot that a model throws far off counts as one dot, not as all of them.
@@ -537,8 +551,8 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     monitor = fit.geometry.monitor
     fit, is_simpler = _with_whole_lens(fit), fit.model.names != BROWN_CONRADY
     off = residuals_sigma(problem, fit.geometry, data)
-    left = np.abs(off)
-    weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(left, 1e-12)))
+    residual = np.abs(off)
+    weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(residual, 1e-12)))
     rows = _slopes_of_residuals(problem, fit, data) * weight[:, None]
     size = fit.model.size
     field_numbers = rows.shape[1] - size
@@ -546,7 +560,7 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     # times its transpose: the covariance
     root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])
     scale = max(
-        1.0, MAD_TO_SIGMA * float(np.median(left)), _scatter_of_dots(data, off, rows.shape[1])
+        1.0, MAD_TO_SIGMA * float(np.median(residual)), _scatter_of_dots(data, off, rows.shape[1])
     )
     if is_simpler:
         # One step of Gauss and Newton from the simple lens to the whole one, as one more error
@@ -571,14 +585,16 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     in_field = (
         np.stack(_slopes_of_places(problem, fit, *_seen_places(fit.geometry))) @ root * to_arcsec
     )
-    seen = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
+    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
     row, column = distance_transform_edt(
-        (~seen).astype(np.int64), return_distances=False, return_indices=True
+        (~is_visible).astype(np.int64), return_distances=False, return_indices=True
     )
     # a place that was not seen has those of its neighbour
-    slopes = slopes[:, (row * seen.shape[1] + column).ravel()]
-    variance = np.where(seen, (slopes**2).sum(axis=(0, 2)).reshape(seen.shape), np.nan)
-    _, size_of, modes = np.linalg.svd(slopes.reshape(2 * seen.size, -1).T, full_matrices=False)
+    slopes = slopes[:, (row * is_visible.shape[1] + column).ravel()]
+    variance = np.where(is_visible, (slopes**2).sum(axis=(0, 2)).reshape(is_visible.shape), np.nan)
+    _, size_of, modes = np.linalg.svd(
+        slopes.reshape(2 * is_visible.size, -1).T, full_matrices=False
+    )
     modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()]
     return Uncertainty(sigma, np.sqrt(variance), modes, np.sqrt((in_field**2).sum(axis=(0, 2))))
 
@@ -616,15 +632,16 @@ def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
 
 def _with_whole_lens(fit: Fit) -> Fit:
     """The same geometry as a fit of the whole lens, whose further parameters are 0."""
-    names, own = fit.model.names, len(fit.model.names)
+    names = fit.model.names
+    own_count = len(fit.model.names)
     if names == BROWN_CONRADY:
         return fit
-    by_name = dict(zip(names, fit.numbers[:own], strict=True))
+    by_name = dict(zip(names, fit.numbers[:own_count], strict=True))
     whole = [by_name.get(name, 0.0) for name in BROWN_CONRADY]
     return replace(
         fit,
         model=replace(fit.model, names=BROWN_CONRADY),
-        numbers=np.concatenate([whole, fit.numbers[own:]]),
+        numbers=np.concatenate([whole, fit.numbers[own_count:]]),
     )
 
 
@@ -635,12 +652,14 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
     varied = geometry_of(
         fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step
     )
-    field = fit.geometry.monitor.lens.field if fit.geometry.monitor.lens is not None else None
-    lens = (
-        varied.monitor.lens
-        if field is None
-        else replace(varied.monitor.lens or Lens(), field=field)
-    )
+    if fit.geometry.monitor.lens is not None:
+        field = fit.geometry.monitor.lens.field
+    else:
+        field = None
+    if field is None:
+        lens = varied.monitor.lens
+    else:
+        lens = replace(varied.monitor.lens or Lens(), field=field)
     return replace(varied, monitor=replace(varied.monitor, lens=lens))
 
 
@@ -649,10 +668,10 @@ def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> Float
     numbers).
     """
     base = residuals_sigma(problem, fit.geometry, data)
-    varied = [
-        residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)
-    ]
-    slopes = np.stack([(each - base) / DIFFERENCE for each in varied], axis=1)
+    varied = []
+    for k in range(fit.model.size):
+        varied.append(residuals_sigma(problem, _varied(problem, fit, k), data))
+    slopes = np.stack([(varied_residual - base) / DIFFERENCE for varied_residual in varied], axis=1)
     if not fit.field_degree:
         return np.asarray(slopes)
     dots = problem.plan

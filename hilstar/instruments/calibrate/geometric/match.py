@@ -93,7 +93,10 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
     """
     # Centroids close to each other are one dot's, and share a group.
     places = np.column_stack([seen.x_px, seen.y_px])
-    area = float(np.prod(np.ptp(places, axis=0))) if len(places) else 0.0
+    if len(places):
+        area = float(np.prod(np.ptp(places, axis=0)))
+    else:
+        area = 0.0
     link_px = min(MAX_LINK_PX, LINK_SHARE * np.sqrt(area / max(len(plan), 1)))
     pairs = cKDTree(places).query_pairs(link_px, output_type="ndarray")
     linked = coo_matrix(
@@ -110,37 +113,40 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
         return Decoded(*(np.zeros(0, dtype=kind) for kind in (np.intp, float, float)))
     order = np.argsort(far, axis=1, kind="stable")
     rows = np.arange(len(far))
-    best, next_best = far[rows, order[:, 0]], far[rows, order[:, 1]]
+    best = far[rows, order[:, 0]]
+    next_best = far[rows, order[:, 1]]
     sure = np.flatnonzero((best <= MAX_CODE_ERRORS) & (next_best >= best + CODE_LEAD) | (best == 0))
     # Where several places blink one dot's code, the one with the fewest errors is taken.
     by_dot: dict[int, list[int]] = {}
     for k in sure:
         by_dot.setdefault(int(order[k, 0]), []).append(int(k))
     chosen = {dot: min(places, key=lambda k: far[k, dot]) for dot, places in by_dot.items()}
-    kept = sorted(chosen.items())
-    means = [(seen.x_px[group == k].mean(), seen.y_px[group == k].mean()) for _, k in kept]
+    chosen_dots = sorted(chosen.items())
+    means = [(seen.x_px[group == k].mean(), seen.y_px[group == k].mean()) for _, k in chosen_dots]
     x_px, y_px = np.array(means).reshape(-1, 2).T
-    return Decoded(np.array([dot for dot, _ in kept], dtype=np.intp), x_px, y_px)
+    return Decoded(np.array([dot for dot, _ in chosen_dots], dtype=np.intp), x_px, y_px)
 
 
 def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     """The projective maps (..., 3, 3) from (u, v) to (x, y), (..., n) each (Hartley and
     Zisserman 2004, 4.1, normalised).
     """
-    into, out = _normal(u, v), _normal(x, y)
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    a, b, _ = np.moveaxis(into @ np.stack([u, v, one], axis=-2), -2, 0)
-    c, d, _ = np.moveaxis(out @ np.stack([x, y, one], axis=-2), -2, 0)
+    into = _normal(u, v)
+    out = _normal(x, y)
+    zero = np.zeros_like(u)
+    ones = np.ones_like(u)
+    a, b, _ = np.moveaxis(into @ np.stack([u, v, ones], axis=-2), -2, 0)
+    c, d, _ = np.moveaxis(out @ np.stack([x, y, ones], axis=-2), -2, 0)
     rows = np.concatenate(
         [
-            np.stack([a, b, one, zero, zero, zero, -c * a, -c * b, -c], axis=-1),
-            np.stack([zero, zero, zero, a, b, one, -d * a, -d * b, -d], axis=-1),
+            np.stack([a, b, ones, zero, zero, zero, -c * a, -c * b, -c], axis=-1),
+            np.stack([zero, zero, zero, a, b, ones, -d * a, -d * b, -d], axis=-1),
         ],
         axis=-2,
     )
     solution = np.linalg.svd(rows)[2][..., -1, :].reshape(into.shape)
-    found = np.linalg.inv(out) @ solution @ into
-    return np.asarray(found / found[..., 2:, 2:])
+    matrix = np.linalg.inv(out) @ solution @ into
+    return np.asarray(matrix / matrix[..., 2:, 2:])
 
 
 def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -148,11 +154,12 @@ def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
     distance of 2.
     """
     scale = np.sqrt(2.0) / np.maximum(np.sqrt(x.var(axis=-1) + y.var(axis=-1)), 1e-300)
-    zero, one = np.zeros_like(scale), np.ones_like(scale)
+    zero = np.zeros_like(scale)
+    ones = np.ones_like(scale)
     rows = [
         [scale, zero, -scale * x.mean(axis=-1)],
         [zero, scale, -scale * y.mean(axis=-1)],
-        [zero, zero, one],
+        [zero, zero, ones],
     ]
     return np.asarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
@@ -183,14 +190,14 @@ def first_look(
     maps = []
     for pose in range(int(seen.pose.max()) + 1):
         part = seen.at(np.flatnonzero(seen.pose == pose))
-        found = _map_of(plan, nominal, part, rng)
-        if found is None:
+        frame_map = _map_of(plan, nominal, part, rng)
+        if frame_map is None:
             raise InputError(_why_no_map(plan, nominal, part, pose, rng))
-        maps.append(found)
+        maps.append(frame_map)
     _refuse_orientation(nominal, maps[0])
     x_px, y_px = _middle_places(plan)
     rays = [_rays_of(matrix, x_px, y_px) for matrix in maps]
-    turns = [Rotation.align_vectors(each, rays[0])[0] for each in rays]
+    turns = [Rotation.align_vectors(pose_rays, rays[0])[0] for pose_rays in rays]
     return FirstLook(tuple(maps), np.array([from_matrix(turn.as_matrix()) for turn in turns]))
 
 
@@ -216,9 +223,9 @@ def turned(plan: DotPlan, nominal: Nominal, look: FirstLook) -> Nominal:
     """
     x_px, y_px = _middle_places(plan)
     monitor = nominal.monitor
-    seen = np.column_stack((*monitor.tangents(x_px, y_px), np.ones_like(x_px)))
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    turn, _ = Rotation.align_vectors(seen, _rays_of(look.maps[0], x_px, y_px))
+    tangent_rays = np.column_stack((*monitor.tangents(x_px, y_px), np.ones_like(x_px)))
+    tangent_rays /= np.linalg.norm(tangent_rays, axis=1, keepdims=True)
+    turn, _ = Rotation.align_vectors(tangent_rays, _rays_of(look.maps[0], x_px, y_px))
     q_cam_to_mon = from_matrix(turn.as_matrix())
     return Nominal(
         replace(monitor, cam_to_image=to_matrix(q_cam_to_mon)), q_cam_to_mon, nominal.tracker
@@ -233,9 +240,10 @@ def _map_of(
 
     RANSAC with samples of four (Fischler and Bolles 1981).
     """
-    found = decode(plan, seen)
-    u, v = nominal.tracker.tangents(found.x_px, found.y_px)
-    x, y = plan.x_px[found.dot], plan.y_px[found.dot]
+    decoded = decode(plan, seen)
+    u, v = nominal.tracker.tangents(decoded.x_px, decoded.y_px)
+    x = plan.x_px[decoded.dot]
+    y = plan.y_px[decoded.dot]
     best = np.zeros(len(u), dtype=bool)
     fours = np.array(
         [
@@ -278,10 +286,14 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
     """Refuse (InputError) an image that is mirrored, swapped or turned by a right angle against
     what the bench file says.
     """
-    u, v = np.array([0.0, 1e-4, 0.0]), np.array([0.0, 0.0, 1e-4])
+    u = np.array([0.0, 1e-4, 0.0])
+    v = np.array([0.0, 0.0, 1e-4])
     rays = np.column_stack([u, v, np.ones_like(u)]) @ nominal.monitor.cam_to_image.T
-    seen, told = np.stack(mapped(matrix, u, v)), np.stack(nominal.monitor.project(rays))
-    relative = (seen[:, 1:] - seen[:, :1]) @ np.linalg.inv(told[:, 1:] - told[:, :1])
+    seen_px = np.stack(mapped(matrix, u, v))
+    stated_px = np.stack(nominal.monitor.project(rays))
+    relative = (seen_px[:, 1:] - seen_px[:, :1]) @ np.linalg.inv(
+        stated_px[:, 1:] - stated_px[:, :1]
+    )
     relative /= np.sqrt(abs(np.linalg.det(relative)))
     turn_deg = float(
         np.degrees(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
@@ -289,10 +301,10 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
     if np.linalg.det(relative) > 0 and abs(turn_deg) < MAX_TURN_DEG:
         return
     nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, relative.ravel())))
-    words = ORIENTATIONS[nearest]
-    if words is not None:
+    way_text = ORIENTATIONS[nearest]
+    if way_text is not None:
         raise InputError(
-            f"the tracker sees the monitor {words}, show the dots again, and take new frames"
+            f"the tracker sees the monitor {way_text}, show the dots again, and take new frames"
         )
 
 
@@ -300,7 +312,8 @@ def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLo
     """Match each centroid to the lit dot nearest to it by the first maps, within what a lens may
     bend.
     """
-    x_px, y_px = np.full(len(seen), np.nan), np.full(len(seen), np.nan)
+    x_px = np.full(len(seen), np.nan)
+    y_px = np.full(len(seen), np.nan)
     u, v = nominal.tracker.tangents(seen.x_px, seen.y_px)
     for pose, matrix in enumerate(look.maps):
         here = seen.pose == pose
@@ -337,8 +350,8 @@ def _nearest(
             mutual = nearest[best] == np.arange(len(here))
             near = mutual & (far[np.arange(len(here)), best] < reach_px)
             dot[here[near]] = lit[best[near]]
-    kept = np.flatnonzero(dot >= 0)
-    return MatchedDots(seen.at(kept), dot[kept])
+    matched = np.flatnonzero(dot >= 0)
+    return MatchedDots(seen.at(matched), dot[matched])
 
 
 def refuse_motion(data: MatchedDots) -> None:
@@ -371,12 +384,17 @@ def frame_shifts(data: MatchedDots, places: FloatArray) -> FrameShifts:
     """The shift of each frame along one axis, by Tukey's median polish over frames and dots."""
     frames, frame = np.unique(data.seen.frame, return_inverse=True)
     dots, dot = np.unique(data.dot, return_inverse=True)
-    shift, middle = np.zeros(len(frames)), np.zeros(len(dots))
+    shift = np.zeros(len(frames))
+    middle = np.zeros(len(dots))
     by_dot = [np.flatnonzero(dot == k) for k in range(len(dots))]
     by_frame = [np.flatnonzero(frame == k) for k in range(len(frames))]
     for _ in range(POLISH_ROUNDS):
-        middle = np.array([np.median(places[each] - shift[frame[each]]) for each in by_dot])
-        shift = np.array([np.median(places[each] - middle[dot[each]]) for each in by_frame])
+        middle = np.array(
+            [np.median(places[dot_rows] - shift[frame[dot_rows]]) for dot_rows in by_dot]
+        )
+        shift = np.array(
+            [np.median(places[dot_rows] - middle[dot[dot_rows]]) for dot_rows in by_frame]
+        )
         shift -= np.median(shift)
-    left = np.abs(places - middle[dot] - shift[frame])
-    return FrameShifts(frames, shift, MAD_TO_SIGMA * float(np.median(left)))
+    residual_px = np.abs(places - middle[dot] - shift[frame])
+    return FrameShifts(frames, shift, MAD_TO_SIGMA * float(np.median(residual_px)))

@@ -64,9 +64,9 @@ class Observed:
 
     def joined(self, other: "Observed") -> "Observed":
         """These centroids and others, of other frames."""
-        joined = {
-            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in COLUMNS
-        }
+        joined = {}
+        for name in COLUMNS:
+            joined[name] = np.concatenate([getattr(self, name), getattr(other, name)])
         return replace(self, **joined, edge_px=max(self.edge_px, other.edge_px))
 
 
@@ -75,8 +75,11 @@ def read_observed(path: Path) -> Observed:
     rows: list[tuple[float, ...]] = []
     for line, cells in read_rows(path, NEEDED, ADVICE, MAX_OBSERVED_BYTES, ("sigma_px", "pose")):
         try:
-            frame_number, x, y = int(cells[0]), float(cells[1]), float(cells[2])
-            sigma, pose_number = float(cells[3] or 1.0), int(cells[4] or 0)
+            frame_number = int(cells[0])
+            x = float(cells[1])
+            y = float(cells[2])
+            sigma = float(cells[3] or 1.0)
+            pose_number = int(cells[4] or 0)
             finite = math.isfinite(x) and math.isfinite(y) and 0 < sigma < math.inf
             if not (finite and 0 <= frame_number < 10**6 and 0 <= pose_number < 1000):
                 raise ValueError
@@ -108,7 +111,10 @@ def measure_images(
     saturated.
     """
     paths_of = numbered(paths)
-    under = None if dark is None else read_image(dark, resolution_px)
+    if dark is None:
+        under = None
+    else:
+        under = read_image(dark, resolution_px)
     settings = dot_centroids(dot_sigma_px)
     places = [_centroids(path, resolution_px, under, settings) for path in paths_of.values()]
     count = [len(x) for x, _ in places]
@@ -136,19 +142,21 @@ def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
     """Images by frame and pose, as `measure_images` takes them from their names. Raises
     InputError.
     """
-    found: dict[tuple[int, int], Path] = {}
+    path_by_number: dict[tuple[int, int], Path] = {}
     for path in paths:  # all names before the first image, which takes a second
-        number, pose_number = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
+        number = NUMBER.search(path.stem)
+        pose_number = POSE.search(str(path.parent.name))
         if number is None or int(number[1]) > 10**6:
             raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
-        frame, pose = int(number[1]), int(pose_number[1]) if pose_number else 0
-        if (frame, pose) in found:
+        frame = int(number[1])
+        pose = int(pose_number[1]) if pose_number else 0
+        if (frame, pose) in path_by_number:
             raise InputError(
-                f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]};"
+                f"{path}: is frame {frame} of pose {pose}, and so is {path_by_number[frame, pose]};"
                 f" {IMAGE_ADVICE}"
             )
-        found[frame, pose] = path
-    return found
+        path_by_number[frame, pose] = path
+    return path_by_number
 
 
 def _centroids(
@@ -164,9 +172,9 @@ def _centroids(
         )
     if under is not None:
         image = image - under
-    found = find_stars(image, settings, noisiest_background(image))
-    kept = ~found.at_edge
-    return found.x_px[kept], found.y_px[kept]
+    stars = find_stars(image, settings, noisiest_background(image))
+    is_whole = ~stars.at_edge
+    return stars.x_px[is_whole], stars.y_px[is_whole]
 
 
 def read_image(
@@ -189,7 +197,8 @@ def read_exposed(
     # A grabbing script may write FITS under any name.
     if path.suffix.lower() in FITS_ENDINGS or is_fits(data):
         fits_image = _fits(path, data, advice, resolution_px)
-        image, exposure_s = fits_image.pixels, fits_image.exposure_s
+        image = fits_image.pixels
+        exposure_s = fits_image.exposure_s
     else:
         image = _picture(path, data, advice, resolution_px)
     if image.ndim != 2:

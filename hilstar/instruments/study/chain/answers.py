@@ -69,7 +69,10 @@ class Answer:
     @property
     def setting(self) -> str:
         """The keys of [render] that make the choice."""
-        stealing = ", bit_stealing = true" if self.row.bit_stealing == "true" else ""
+        if self.row.bit_stealing == "true":
+            stealing = ", bit_stealing = true"
+        else:
+            stealing = ""
         return f'quantisation = "{self.row.quantisation}"{stealing}'
 
     @property
@@ -193,7 +196,8 @@ def turn_lines(
     budget: Sequence[ErrorPart],
 ) -> list[str]:
     """A line for each turn from which on another step is most of the error, and what to do then."""
-    lines, last = [], ""
+    lines = []
+    last = ""
     for rows in scenes:
         scene = rows[0]
         part = largest_part(budget, scene.scene)

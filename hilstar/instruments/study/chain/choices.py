@@ -101,24 +101,24 @@ class Combination:
 
 def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> list[Combination]:
     """All combinations that are measured, for a scene that turns or one at rest."""
-    found: list[Combination] = []
+    chosen: list[Combination] = []
     shallow = faintest_v_mag - SHALLOWER_MAG
     for stealing in (False, True) if can_steal_bits else (False,):
         for method in QUANTISATIONS:
-            found += [Combination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES]
+            chosen += [Combination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES]
             if turns:
                 crude: list[tuple[Smear, Prediction]] = [
                     ("point", "rate"),
                     ("path", "two samples"),
                     ("point", "held"),
                 ]
-                found += [
+                chosen += [
                     Combination(method, stealing, faintest_v_mag, "cut", *ways) for ways in crude
                 ]
-        found += [Combination(method, stealing, shallow, "cut") for method in ("round", "exact")]
+        chosen += [Combination(method, stealing, shallow, "cut") for method in ("round", "exact")]
         if turns:
-            found.append(Combination("round", stealing, shallow, "cut", "point", "held"))
-    return found
+            chosen.append(Combination("round", stealing, shallow, "cut", "point", "held"))
+    return chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +136,8 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     where it has no stars.
     """
     fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
-    seen = [bench.sprites(q).data["electrons_per_s"] for q in fields]
-    counts = np.array([len(rates) for rates in seen])
+    star_rates = [bench.sprites(q).data["electrons_per_s"] for q in fields]
+    counts = np.array([len(rates) for rates in star_rates])
     if not counts.any():
         raise InputError(
             f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger"
@@ -146,9 +146,10 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     typical = float(np.median(counts[counts > 0]))
     average = fields[np.argmin(np.abs(counts - typical))]
     brightest = np.array(
-        [rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in seen]
+        [rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in star_rates]
     )
-    faint, dense = fields[np.argmin(brightest)], fields[np.argmax(counts)]
+    faint = fields[np.argmin(brightest)]
+    dense = fields[np.argmax(counts)]
     return (
         ChainScene("average field", "what most frames are", average),
         ChainScene("dense field", "the most stars: time", dense),
@@ -185,7 +186,10 @@ class PanelExposure:
         total = np.zeros(height * width)
         for number, light_ns, weight in zip(self.numbers, self.light_ns, self.weights, strict=True):
             place, light = light_of(number, light_ns)
-            at = place // width if weight.shape[1] == 1 else place % width
+            if weight.shape[1] == 1:
+                at = place // width
+            else:
+                at = place % width
             total[place] += weight.ravel()[at] * light
         return total.reshape(height, width)
 
@@ -204,22 +208,21 @@ def exposure_s(bench: Bench) -> float:
 
 def shortened_line(bench: Bench) -> str | None:
     """The note for an exposure that is longer than its measured part, or None."""
-    whole_s, measured_s = bench.config.tracker.exposure_s, exposure_s(bench)
-    said = (
+    whole_s = bench.config.tracker.exposure_s
+    measured_s = exposure_s(bench)
+    exposure_text = (
         f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker]"
         f" exposure_s = {whole_s:g}"
     )
-    return None if measured_s == whole_s else said
+    return None if measured_s == whole_s else exposure_text
 
 
 def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     """An exposure that begins START_S after the first light of a frame's middle row."""
-    period_s, length_s, scan, size = (
-        1 / bench.config.monitor.refresh_hz,
-        exposure_s(bench),
-        bench.scan,
-        bench.camera.resolution_px,
-    )
+    period_s = 1 / bench.config.monitor.refresh_hz
+    length_s = exposure_s(bench)
+    scan = bench.scan
+    size = bench.camera.resolution_px
     begin_s = first_frame * period_s + START_S % period_s
     before = math.ceil((scan.scanout_s / 2 + scan.hold_s) / period_s) + 1
     numbers = np.arange(
@@ -230,11 +233,10 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     turned = bool(scan.down[0])
     along = np.arange(size[0] if turned else size[1], dtype=np.float64)
     middle = np.full(len(along), (size[1 if turned else 0] - 1) / 2)
-    late_s = (
-        scan.late_s(along, middle, size)[None, :]
-        if turned
-        else scan.late_s(middle, along, size)[:, None]
-    )
+    if turned:
+        late_s = scan.late_s(along, middle, size)[None, :]
+    else:
+        late_s = scan.late_s(middle, along, size)[:, None]
     lit_s = numbers[:, None, None] * period_s + late_s
     # Weights add up to 1 over a whole number of refreshes: a panel that flashes gives a refresh's
     # light at once.
@@ -320,10 +322,9 @@ class Parts(Closing):
     def marks(self, movement: Movement) -> Marks:
         """What the marked combinations choose for a scene."""
         defaults = RenderSettings()
-        plain = {
-            name: getattr(defaults, name)
-            for name in ("effort", "quantisation", "bit_stealing", "motion_above_px")
-        }
+        plain = {}
+        for name in ("effort", "quantisation", "bit_stealing", "motion_above_px"):
+            plain[name] = getattr(defaults, name)
         ahead = self._file.config.attitude.max_extrapolation_ms > 0
         return Marks(
             self._chosen(self._with(plain), movement, True),

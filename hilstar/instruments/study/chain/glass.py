@@ -78,19 +78,18 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
     glass, or too few stars.
     """
     tracker = file.config.tracker
-    whole = (
-        None
-        if tracker.optics.psf == GAUSSIAN
-        else tracker_psf(replace(tracker, effort="full"), file.folder)
-    )
+    if tracker.optics.psf == GAUSSIAN:
+        whole = None
+    else:
+        whole = tracker_psf(replace(tracker, effort="full"), file.folder)
     if not isinstance(whole, GlassPsf):
         return []
-    found = dict(_drawable(whole))
+    drawable = dict(_drawable(whole))
     with ExitStack() as stack:
         simulators = {
-            name: stack.enter_context(Simulator(file, psf=psf)) for name, psf in found.items()
+            name: stack.enter_context(Simulator(file, psf=psf)) for name, psf in drawable.items()
         }
-        errors = _errors(next(iter(simulators.values())), whole, found, scene)
+        errors = _errors(next(iter(simulators.values())), whole, drawable, scene)
         if not errors:
             return []
         view = next(iter(simulators.values())).view(scene.q_icrs_to_cam, np.zeros(3))
@@ -101,7 +100,7 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         taken = in_turn(works, MAX_ROUNDS, (QUICK_TIME_S if quick else TIME_S) / len(works))
     times: dict[str, Times] = {name: times_of(np.array(one)) for name, one in taken.items()}
     fronts = pareto_front(
-        [errors[name][1] for name in found], [times[name].time_ms for name in found]
+        [errors[name][1] for name in drawable], [times[name].time_ms for name in drawable]
     )
     auto = least_tracker_psf(
         whole, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
@@ -116,7 +115,7 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
             on_front=said(bool(on)),
             chosen=AUTO if name == auto else "",
         )
-        for (name, psf), on in zip(found.items(), fronts, strict=True)
+        for (name, psf), on in zip(drawable.items(), fronts, strict=True)
     ]
 
 
@@ -142,10 +141,8 @@ def _errors(
     lit = light.sum(axis=(1, 2)) > 0  # a corner may be dark
     if lit.sum() < MIN_STARS:
         return {}
-    kind, arcsec_per_px = (
-        tracker.config.verify.judge or "window",
-        ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1],
-    )
+    kind = tracker.config.verify.judge or "window"
+    arcsec_per_px = ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1]
 
     def measured(stamps: FloatArray) -> FloatArray:
         return np.stack(
@@ -153,13 +150,11 @@ def _errors(
         )
 
     def off(psf: Psf) -> tuple[int, float, float, float]:
-        told = told_psf(psf, (row, column), 2 * reach + 1, shares)
-        x, y, flux = measured(told(rows["x_px"] - column, rows["y_px"] - row))
-        place, percent = (
-            np.hypot(x - true[0], y - true[1]) * arcsec_per_px,
-            100 * (flux / true[2] - 1),
-        )
-        rms = [rounded(float(np.sqrt(np.mean(one**2)))) for one in (place, percent)]
+        psf_stamp = told_psf(psf, (row, column), 2 * reach + 1, shares)
+        x, y, flux = measured(psf_stamp(rows["x_px"] - column, rows["y_px"] - row))
+        place = np.hypot(x - true[0], y - true[1]) * arcsec_per_px
+        percent = 100 * (flux / true[2] - 1)
+        rms = [rounded(float(np.sqrt(np.mean(error_px**2)))) for error_px in (place, percent)]
         return len(place), rms[0], rms[1], rounded(float(np.abs(percent).max()))
 
     true = measured(light)
@@ -184,10 +179,8 @@ def draw_glass(place: "Axes", light: "Axes", rows: list[GlassRow]) -> None:
         floor = min((getattr(row, error) for row in rows if getattr(row, error) > 0), default=1.0)
         named = []
         for row in rows:
-            at, colour = (
-                (row.time_ms, max(getattr(row, error), floor)),
-                RED if row.chosen else BLUE if row.on_front == "true" else INK,
-            )
+            at = (row.time_ms, max(getattr(row, error), floor))
+            colour = RED if row.chosen else BLUE if row.on_front == "true" else INK
             axes.plot(
                 [max(at[0] - row.noise_ms, at[0] / 2), at[0] + row.noise_ms],
                 [at[1]] * 2,
@@ -196,10 +189,10 @@ def draw_glass(place: "Axes", light: "Axes", rows: list[GlassRow]) -> None:
                 alpha=0.4,
             )
             axes.plot(*at, "o", color=colour, ms=6 if row.on_front == "true" else 4)
-            words = row.psf + (f" ({row.chosen})" if row.chosen else "")
+            row_text = row.psf + (f" ({row.chosen})" if row.chosen else "")
             named.append(
                 (
-                    f"{words}: {two_digits(getattr(row, error))}, {two_digits(row.time_ms)} ms",
+                    f"{row_text}: {two_digits(getattr(row, error))}, {two_digits(row.time_ms)} ms",
                     at,
                     colour,
                 )

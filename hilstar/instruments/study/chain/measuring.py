@@ -80,11 +80,14 @@ class DrawingChain:
         """The rate along which stars are drawn as paths, rad/s; None where they are drawn as
         points.
         """
-        return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
+        if self.combination.smear == "path":
+            return attitude.rate_cam_rad_s
+        return None
 
     def lit(self, number: int, light_ns: int) -> choices.Lit:
         """The pixels that a frame's codes light, and the light of each, electrons per second."""
-        attitude, panel = self.attitude(light_ns), self.bench.panel
+        attitude = self.attitude(light_ns)
+        panel = self.bench.panel
         levels = self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude)).levels.ravel()
         place = np.flatnonzero(levels)
         light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
@@ -102,7 +105,8 @@ class DrawingChain:
         sides = [side.side_px for side in self.bench.renderer.target.sides] or [
             self.bench.psf.footprint_px
         ]
-        low, high = min(sides), max(sides)
+        low = min(sides)
+        high = max(sides)
         return f"{low}" if low == high else f"{low} to {high}"
 
     def frame_ms(self) -> Spent:
@@ -138,8 +142,8 @@ class DrawingChain:
         light_ns = NS_PER_S + self.timed_frames * round(
             NS_PER_S / self.bench.config.monitor.refresh_hz
         )
-        own = propagate(self.movement.q_icrs_to_cam, NUDGE_RAD, self.timed_frames)
-        return self.timeline(replace(self.movement, q_icrs_to_cam=own), light_ns), light_ns
+        attitudes = propagate(self.movement.q_icrs_to_cam, NUDGE_RAD, self.timed_frames)
+        return self.timeline(replace(self.movement, q_icrs_to_cam=attitudes), light_ns), light_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,20 +264,22 @@ class SceneMeasurement:
     def __init__(
         self, parts: choices.Parts, tracker: StudyTracker, scene: choices.ChainScene, plan: Rounds
     ) -> None:
-        self.parts, self.tracker, self.scene, self.plan = parts, tracker, scene, plan
+        self.parts = parts
+        self.tracker = tracker
+        self.scene = scene
+        self.plan = plan
         self.movement = Movement(scene.q_icrs_to_cam, scene.rate_deg_s)
         self.marks: choices.Marks = parts.marks(self.movement)
-        found = choices.combinations(
+        possible = choices.combinations(
             self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag
         )
         marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
-        self.combinations = list(dict.fromkeys([*found, *marked]))
+        self.combinations = list(dict.fromkeys([*possible, *marked]))
         # At rest each exposure has its stars at other sub-pixel phases.
-        step_rad = (
-            np.zeros(3)
-            if self.movement.turns
-            else np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
-        )
+        if self.movement.turns:
+            step_rad = np.zeros(3)
+        else:
+            step_rad = np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
         self.judges = []
         for k, number in enumerate(FIRST_FRAMES[: plan.exposures]):
             moved = replace(
@@ -309,9 +315,9 @@ class SceneMeasurement:
 
     def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
         """A combination's row of the table."""
-        own = chain.combination
+        own_combination = chain.combination
         chosen = {DEFAULT: self.marks.default, AUTO: self.marks.auto}
-        marked = [name for name, combination in chosen.items() if combination == own]
+        marked = [name for name, combination in chosen.items() if combination == own_combination]
         return CombinationRow(
             scene=self.scene.name,
             rate_deg_s=self.scene.rate_deg_s,
@@ -319,36 +325,40 @@ class SceneMeasurement:
             bits=self.parts.own.config.monitor.bits,
             sprite_px=chain.sprite_px(),
             chosen=" ".join(marked),
-            as_filed=said(own == self.marks.as_filed),
-            **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
-            **asdict(self.error(own)),
+            as_filed=said(own_combination == self.marks.as_filed),
+            **(asdict(own_combination) | {"bit_stealing": said(own_combination.bit_stealing)}),
+            **asdict(self.error(own_combination)),
             **asdict(taken),
         )
 
     def error(self, combination: choices.Combination) -> Error:
         """A combination's error over all exposures."""
-        found, turns = [], []
+        star_errors = []
+        turns = []
         for number, judge in enumerate(self.judges):
             light = self.chain(combination, number).exposed(judge.seen)
             shown = judge.measure(self.tracker.image_e(light, judge.seen))
-            found.append(off(judge, shown, judge.sky))
+            star_errors.append(off(judge, shown, judge.sky))
             turns.append(attitude_off_arcsec(shown, judge.sky))
-        arcsec, mag = pooled(found)
+        arcsec, mag = pooled(star_errors)
         cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))
-        lost = sum(int(one.lost.sum()) for one in found)
+        lost = sum(int(field_errors.lost.sum()) for field_errors in star_errors)
         return Error(self.star_count, lost, *map(rounded, (arcsec, mag, cross, roll)))
 
 
 def rms_of_known(values: Sequence[float]) -> float:
     """The rms of the finite values; NaN where there is none."""
     known = [value for value in values if math.isfinite(value)]
-    return math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
+    if known:
+        return math.sqrt(sum(value**2 for value in known) / len(known))
+    return math.nan
 
 
 def pooled(found: Sequence[Off]) -> tuple[float, float]:
     """The rms over the stars of several exposures, arcsec and mag."""
     arcsec, mag = (
-        np.concatenate([getattr(one, name) for one in found]) for name in ("arcsec", "mag")
+        np.concatenate([getattr(field_errors, name) for field_errors in found])
+        for name in ("arcsec", "mag")
     )
     return math.sqrt(float(np.mean(arcsec**2))), math.sqrt(float(np.mean(mag**2)))
 
@@ -365,7 +375,8 @@ def timed(
         chain.frame_ms()
     taken: list[list[Spent]] = [[] for _ in chains]
     stages: list[tuple[float, ...]] = []
-    rng, begin = np.random.default_rng(SEED), time.perf_counter()
+    rng = np.random.default_rng(SEED)
+    begin = time.perf_counter()
     for number in range(MAX_ROUNDS):
         if number >= MIN_ROUNDS and time.perf_counter() - begin > time_s:
             break
@@ -376,7 +387,7 @@ def timed(
                 stages += [chain.stages_ms() for _ in range(FRAMES_A_VISIT)]
             else:
                 taken[k] += [chain.frame_ms() for _ in range(FRAMES_A_VISIT)]
-    return [times_of(np.array(one)) for one in taken], np.median(stages, axis=0).tolist()
+    return [times_of(np.array(times_ms)) for times_ms in taken], np.median(stages, axis=0).tolist()
 
 
 def times_of(taken: FloatArray) -> Times:
@@ -391,12 +402,14 @@ def times_of(taken: FloatArray) -> Times:
 
 def rounded(value: float) -> float:
     """A figure with the tables' four digits."""
-    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
+    if math.isfinite(value):
+        return float(f"{value:.{DIGITS}g}")
+    return value
 
 
 def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
     """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
-    found = [
+    errors_by_part = [
         [
             judge.sky,
             *(
@@ -410,8 +423,8 @@ def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> l
     def between(before: int, after: int) -> tuple[float, float]:
         return pooled(
             [
-                off(judge, one[after], one[before])
-                for judge, one in zip(scene.judges, found, strict=True)
+                off(judge, field_errors[after], field_errors[before])
+                for judge, field_errors in zip(scene.judges, errors_by_part, strict=True)
             ]
         )
 
@@ -429,11 +442,16 @@ def _lights(
     scene: SceneMeasurement, combination: choices.Combination, number: int
 ) -> Iterator[FloatArray]:
     """The mean light (H, W) of an exposure after each of STEPS."""
-    chain, seen = scene.chain(combination, number), scene.judges[number].seen
-    movement, bench, every = chain.movement, chain.bench, scene.parts.own.stars
+    chain = scene.chain(combination, number)
+    visible = scene.judges[number].seen
+    movement = chain.movement
+    bench = chain.bench
+    every = scene.parts.own.stars
 
     def exposed(light_of: Callable[[int, int], choices.Lit]) -> FloatArray:
-        return (seen.mean if movement.turns else seen.at_rest)(light_of, bench.camera.resolution_px)
+        return (visible.mean if movement.turns else visible.at_rest)(
+            light_of, bench.camera.resolution_px
+        )
 
     def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> choices.Lit:
         if along_paths:
@@ -461,5 +479,5 @@ def _lights(
     yield shown_as(every, movement.turns)
     yield shown_as(every, along_paths)
     yield shown_as(bench.shown_stars, along_paths)
-    yield scene.chain(replace(combination, sprite="full"), number).exposed(seen)
-    yield chain.exposed(seen)
+    yield scene.chain(replace(combination, sprite="full"), number).exposed(visible)
+    yield chain.exposed(visible)

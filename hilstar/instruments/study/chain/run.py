@@ -132,16 +132,18 @@ def beating(
     Beyond it are those faster by more than three sigmas of the difference of the medians. Else this
     run cannot tell the times apart, and which row is on the front is chance.
     """
-    own = rows[auto_of(rows)]
-    kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
-    beats = beaten_by([row.error_arcsec for row in kept], [row.time_ms for row in kept])[
-        kept.index(own)
+    auto_row = rows[auto_of(rows)]
+    rivals = [row for row in rows if not as_filed or left_to_effort(row, auto_row)]
+    beats = beaten_by([row.error_arcsec for row in rivals], [row.time_ms for row in rivals])[
+        rivals.index(auto_row)
     ]
     beyond: list[CombinationRow] = []
     within: list[CombinationRow] = []
-    for row in (row for row, does in zip(kept, beats, strict=True) if does):
-        noise_ms = 3 * math.hypot(own.noise_ms, row.noise_ms)
-        (beyond if own.time_ms - row.time_ms > noise_ms or not noise_ms else within).append(row)
+    for row in (row for row, does in zip(rivals, beats, strict=True) if does):
+        noise_ms = 3 * math.hypot(auto_row.noise_ms, row.noise_ms)
+        (beyond if auto_row.time_ms - row.time_ms > noise_ms or not noise_ms else within).append(
+            row
+        )
     return beyond, within
 
 
@@ -154,12 +156,11 @@ def scene_line(
     """One scene: the choice of `auto`, its error and time, its place relative to the front, and
     the largest part of each.
     """
-    own, stands = rows[auto_of(rows)], NOT_JUDGED if load.busy else standing(rows)
+    own = rows[auto_of(rows)]
+    stands = NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
-    largest, longest = (
-        max(steps, key=lambda part: part.error_arcsec),
-        max(stages, key=lambda one: one.time_ms),
-    )
+    largest = max(steps, key=lambda part: part.error_arcsec)
+    longest = max(stages, key=lambda one: one.time_ms)
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
     return (
         f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and"
@@ -172,16 +173,15 @@ def scene_line(
 
 def headline(rows: Sequence[CombinationRow], load: Load) -> str:
     """What the whole table says of `auto`; nothing on a busy machine."""
-    scenes = [
-        [row for row in rows if row.scene == name]
-        for name in dict.fromkeys(row.scene for row in rows)
-    ]
-    beaten = [own[0].scene for own in scenes if beating(own)[0]]
+    scenes = []
+    for name in dict.fromkeys(row.scene for row in rows):
+        scenes.append([row for row in rows if row.scene == name])
+    beaten = [auto_rows[0].scene for auto_rows in scenes if beating(auto_rows)[0]]
     where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
-    said = f", not in {', '.join(beaten)}" if beaten else ""
+    exceptions_text = f", not in {', '.join(beaten)}" if beaten else ""
     return load.title(
         'The choice of effort = "auto" is on the front of error against time, or within its noise,'
-        f" {where}{said}"
+        f" {where}{exceptions_text}"
     )
 
 
@@ -190,33 +190,37 @@ def standing(rows: Sequence[CombinationRow]) -> str:
     place among effort's choices.
     """
     beyond, within = beating(rows)
-    own = rows[auto_of(rows)]
+    auto_row = rows[auto_of(rows)]
     if not beyond:
-        return (
-            f"on the front within the noise: {_compared(own, _nearest(within))}"
-            if within
-            else "on the front"
-        )
+        if within:
+            return f"on the front within the noise: {_compared(auto_row, _nearest(within))}"
+        return "on the front"
     best = _nearest(beyond)
-    said = f"not on the front: {_compared(own, best)}: {why_not(own, best)}"
+    standing_text = f"not on the front: {_compared(auto_row, best)}: {why_not(auto_row, best)}"
     if best in (own_beyond := beating(rows, as_filed=True)[0]):
-        return said
+        return standing_text
     if own_beyond:
         nearest = _nearest(own_beyond)
         return (
-            f"{said}; nor of what effort may choose: {_compared(own, nearest)}:"
-            f" {why_not(own, nearest)}"
+            f"{standing_text}; nor of what effort may choose: {_compared(auto_row, nearest)}:"
+            f" {why_not(auto_row, nearest)}"
         )
     return (
-        f"{said}; on the front of what effort may"
+        f"{standing_text}; on the front of what effort may"
         f" choose{', within the noise' if beating(rows, as_filed=True)[1] else ''}"
     )
 
 
 def words(row: CombinationRow) -> str:
     """A row's combination in a few words."""
-    stealing = " with bit stealing" if row.bit_stealing == "true" else ""
-    moving = f", {row.smear}s, {row.prediction}" if row.rate_deg_s else ""
+    if row.bit_stealing == "true":
+        stealing = " with bit stealing"
+    else:
+        stealing = ""
+    if row.rate_deg_s:
+        moving = f", {row.smear}s, {row.prediction}"
+    else:
+        moving = ""
     return f"{row.quantisation}{stealing}, {row.sprite} sprites{moving}"
 
 
@@ -273,17 +277,17 @@ def _compared(own: CombinationRow, other: CombinationRow) -> str:
 
 def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
     """The scenes to be drawn, each with those of its rate in which `auto` is as far off."""
-    kept: dict[str, list[str]] = {}
+    rivals: dict[str, list[str]] = {}
     autos: dict[str, CombinationRow] = {}
-    for own in (row for row in rows if AUTO in row.chosen):
+    for auto_row in (row for row in rows if AUTO in row.chosen):
         for scene, other in autos.items():
-            low, high = sorted((own.error_arcsec, other.error_arcsec))
-            if other.rate_deg_s == own.rate_deg_s and high <= ALIKE * low:
-                kept[scene].append(own.scene)
+            low, high = sorted((auto_row.error_arcsec, other.error_arcsec))
+            if other.rate_deg_s == auto_row.rate_deg_s and high <= ALIKE * low:
+                rivals[scene].append(auto_row.scene)
                 break
         else:
-            kept[own.scene], autos[own.scene] = [], own
-    return kept
+            rivals[auto_row.scene], autos[auto_row.scene] = [], auto_row
+    return rivals
 
 
 def draw(
@@ -301,13 +305,13 @@ def draw(
         path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count
     ) as grid:
         for axes, (scene, alike) in zip(grid, scenes.items(), strict=False):
-            own = [row for row in rows if row.scene == scene]
+            scene_rows = [row for row in rows if row.scene == scene]
             axes.set_title(
-                f"{scene}, {own[0].stars} stars"
+                f"{scene}, {scene_rows[0].stars} stars"
                 + (f" (the same in: {', '.join(alike)})" if alike else "")
             )
             axes.set(xscale="log", yscale="log", ylabel="star's place, rms [arcsec]")
-            _scatter(axes, own)
+            _scatter(axes, scene_rows)
         grid[len(scenes) - 1].set_xlabel("median time of a frame [ms]")
         if glass:
             draw_glass(grid[-2], grid[-1], glass)
@@ -323,8 +327,10 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
         times_ms, errors = zip(*(place for _, place in front), strict=True)
         axes.step(times_ms, errors, where="post", color=charts.INK, lw=1.2, zorder=2)
     for row, place in zip(rows, at, strict=True):
-        colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
-        early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
+        colour = COLOURS[row.quantisation]
+        on_front = row.on_front == "true"
+        early = max(place[0] - row.noise_ms, place[0] / 2)
+        late = place[0] + row.noise_ms
         axes.plot([early, late], [place[1]] * 2, color=colour, lw=1.0, alpha=0.4)
         axes.plot(
             *place,
@@ -355,14 +361,16 @@ def side_names(
 ) -> charts.SideNames:
     """The names beside a scene's points: of the front, of what is chosen, and of other codes."""
     named: list[tuple[str, tuple[float, float], str]] = []
-    last, auto = math.inf, rows[auto_of(rows)]
+    last = math.inf
+    auto = rows[auto_of(rows)]
     for row, place in zip(rows, at, strict=True):
         if row.on_front == "true" and place[1] < LESS * last and not row.chosen:
             named.append((short_words(row, auto), place, COLOURS[row.quantisation]))
             last = place[1]
     for row, place in zip(rows, at, strict=True):
         if row.chosen:
-            arcsec, ms = charts.two_digits(row.error_arcsec), charts.two_digits(row.time_ms)
+            arcsec = charts.two_digits(row.error_arcsec)
+            ms = charts.two_digits(row.time_ms)
             label = f"{row.chosen.replace(' ', ', ')}: {arcsec} arcsec, {ms} ms"
             named.append((label, place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT]))
     for quantisation, colour in COLOURS.items():
@@ -380,11 +388,18 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     """A row's combination for a chart: without its sprites, and with its depth only where that
     differs from `own`.
     """
-    shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
-    moving = (
-        f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
-    )
-    stealing = " + bit stealing" if row.bit_stealing == "true" else ""
+    if row.faintest_v_mag < own.faintest_v_mag:
+        shallow = ", fewer stars"
+    else:
+        shallow = ""
+    if row.rate_deg_s:
+        moving = f", {row.smear}s by {row.prediction}".replace("by held", "held")
+    else:
+        moving = ""
+    if row.bit_stealing == "true":
+        stealing = " + bit stealing"
+    else:
+        stealing = ""
     return f"{row.quantisation}{stealing}{moving}{shallow}"
 
 
@@ -458,7 +473,9 @@ def run(
     rows: list[CombinationRow] = []
     budget: list[ErrorPart] = []
     stages: list[StageTime] = []
-    lines, judged, others = [], [], OtherWork()
+    lines = []
+    judged = []
+    others = OtherWork()
     with Parts(file) as parts, StudyTracker(parts.own) as tracker:
         scenes = five_scenes(parts.own)
         for number, scene in enumerate(scenes):
@@ -470,15 +487,16 @@ def run(
                 )
                 continue
             outcomes, parts_of_time = measurement.outcomes()
-            own, parts_of_error = (
-                rows_of(outcomes),
-                error_budget(measurement, measurement.marks.auto),
-            )
-            judged.append((own, parts_of_error, parts_of_time))
-            rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
+            chain_rows = rows_of(outcomes)
+            parts_of_error = error_budget(measurement, measurement.marks.auto)
+            judged.append((chain_rows, parts_of_error, parts_of_time))
+            rows = rows + chain_rows
+            budget = budget + parts_of_error
+            stages = stages + parts_of_time
             advance(number + 1)
         machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
-        shortened, glass = shortened_line(parts.own), glass_rows(file, scenes[DENSE], quick)
+        shortened = shortened_line(parts.own)
+        glass = glass_rows(file, scenes[DENSE], quick)
     if not rows:
         raise InputError(
             f"{file.path}: no star stands alone in view in any scene; write a larger [sky]"
@@ -508,7 +526,7 @@ def run(
     ]
     draw(directory / "chain", rows, headline(rows, load), "; ".join(notes), glass)
     draw_budget(directory / "chain_budget", rows, budget, stages, load)
-    right = not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
+    right = not any(beating(chain_rows, as_filed=True)[0] for chain_rows, _, _ in judged)
     return ChainStudy(
         [*lines, *notes], None if load.busy else right, answer_lines(rows, budget, load)
     )

@@ -59,17 +59,16 @@ def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArr
     """The sky's own mean light (H, W) over an exposure, electrons per second, by enough instants
     for every star's path.
     """
-    times_s, shares = [seen.begin_s + seen.length_s / 2], [1.0]
+    times_s = [seen.begin_s + seen.length_s / 2]
+    shares = [1.0]
     if movement.turns:
         path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
         sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.psf.width_px)
         nodes, weights = np.polynomial.legendre.leggauss(
             max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3)
         )
-        times_s, shares = (
-            (seen.begin_s + seen.length_s * (nodes + 1) / 2).tolist(),
-            (weights / 2).tolist(),
-        )
+        times_s = (seen.begin_s + seen.length_s * (nodes + 1) / 2).tolist()
+        shares = (weights / 2).tolist()
     total = np.zeros(bench.camera.resolution_px[::-1])
     for t_s, share in zip(times_s, shares, strict=True):
         sprites = points(bench, movement.at(round(t_s * NS_PER_S)))
@@ -188,16 +187,16 @@ class StarJudge:
             return self._measure_paths(image_e)
         match = self.tracker.finder.match(image_e, self._x_px, self._y_px)
         index = match.index[self.judged]
-        found = index >= 0
-        if not found.any():
+        is_matched = index >= 0
+        if not is_matched.any():
             return MeasuredStars(np.full((len(index), 3), np.nan), np.zeros(len(index)))
-        index = np.where(found, index, 0)
+        index = np.where(is_matched, index, 0)
         directions = normalise(
             self.tracker.camera.rays(match.found.x_px[index], match.found.y_px[index])
         )
         return MeasuredStars(
-            np.where(found[:, None], directions, np.nan),
-            np.where(found, match.found.flux[index], 0.0),
+            np.where(is_matched[:, None], directions, np.nan),
+            np.where(is_matched, match.found.flux[index], 0.0),
         )
 
     def _whole(self, star: IntArray) -> BoolArray:
@@ -215,28 +214,34 @@ class StarJudge:
         reach_px = self._reach_px
         y, x = np.mgrid[-reach_px : reach_px + 1, -reach_px : reach_px + 1]
         disc = (x * x + y * y <= reach_px**2).nonzero()
-        near_x, near_y = disc[1] - reach_px, disc[0] - reach_px
-        width, flat = sky_e.shape[1], sky_e.ravel()
-        judged, pixels = [], []
+        near_x = disc[1] - reach_px
+        near_y = disc[0] - reach_px
+        width = sky_e.shape[1]
+        flat = sky_e.ravel()
+        judged = []
+        pixels = []
         for k in np.flatnonzero(self._wanted):
-            column, row = np.rint(x_px[:, k]).astype(np.intp), np.rint(y_px[:, k]).astype(np.intp)
-            own = np.unique((row[:, None] + near_y) * width + column[:, None] + near_x)
-            if flat[own].sum() <= (1 + OTHERS_SHARE) * self._e[k]:
+            column = np.rint(x_px[:, k]).astype(np.intp)
+            row = np.rint(y_px[:, k]).astype(np.intp)
+            own_pixels = np.unique((row[:, None] + near_y) * width + column[:, None] + near_x)
+            if flat[own_pixels].sum() <= (1 + OTHERS_SHARE) * self._e[k]:
                 judged.append(k)
-                pixels.append(own)
+                pixels.append(own_pixels)
         self.judged = np.array(judged, dtype=np.intp)
         self._pixels = np.concatenate(pixels) if pixels else np.zeros(0, dtype=np.intp)
-        self._begins = np.cumsum([0, *(len(own) for own in pixels)])[:-1]
+        self._begins = np.cumsum([0, *(len(own_pixels) for own_pixels in pixels)])[:-1]
 
     def _paths(self) -> tuple[FloatArray, FloatArray]:
         """Places (k, n) of the stars on the tracker along their whole paths, px."""
-        tracker, seen = self.tracker, self.seen
+        tracker = self.tracker
+        visible = self.seen
         count = max(5, math.ceil(self._path_px / PATH_STEP_PX))
-        at_s = np.linspace(-self._late_s, seen.length_s + self._late_s, count) + seen.begin_s
-        turns = [
-            tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S)))
-            for t in at_s
-        ]
+        at_s = np.linspace(-self._late_s, visible.length_s + self._late_s, count) + visible.begin_s
+        turns = []
+        for t in at_s:
+            turns.append(
+                tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S)))
+            )
         vectors = tracker.bench.stars.directions(self._star)
         places = [tracker.camera.project(vectors @ turn.T) for turn in turns]
         return np.stack([x for x, _ in places]), np.stack([y for _, y in places])
@@ -244,16 +249,17 @@ class StarJudge:
     def _measure_paths(self, image_e: FloatArray) -> MeasuredStars:
         if not len(self.judged):
             return MeasuredStars(np.zeros((0, 3)), np.zeros(0))
-        width, light = image_e.shape[1], image_e.ravel()[self._pixels]
+        width = image_e.shape[1]
+        light = image_e.ravel()[self._pixels]
         row, column = np.divmod(self._pixels, width)
         total, by_x, by_y = (
             np.add.reduceat(part, self._begins) for part in (light, light * column, light * row)
         )
-        found = total > LOST_SHARE * self._e[self.judged]
-        divisor = np.where(found, total, 1.0)
+        is_lit = total > LOST_SHARE * self._e[self.judged]
+        divisor = np.where(is_lit, total, 1.0)
         directions = normalise(self.tracker.camera.rays(by_x / divisor, by_y / divisor))
         return MeasuredStars(
-            np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0)
+            np.where(is_lit[:, None], directions, np.nan), np.where(is_lit, total, 0.0)
         )
 
     def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
@@ -295,10 +301,10 @@ def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[fl
     """Attitude error across the boresight and about it, least squares over the found stars; NaN
     for fewer than two.
     """
-    found = ~(shown.lost | wanted.lost)
-    if found.sum() < 2:
+    is_usable = ~(shown.lost | wanted.lost)
+    if is_usable.sum() < 2:
         return math.nan, math.nan
     x, y, z = ARCSEC_PER_RAD * turn_between(
-        wanted.directions[found], shown.directions[found], np.ones(found.sum())
+        wanted.directions[is_usable], shown.directions[is_usable], np.ones(is_usable.sum())
     )
     return math.hypot(x, y), abs(float(z))

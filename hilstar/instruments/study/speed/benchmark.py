@@ -108,12 +108,14 @@ def scene(
         raise InputError(
             "bench: the bench file leaves no star to show; write a larger [sky] faintest_v_mag"
         )
-    seen = bench.sprites(q_icrs_to_cam, every).star
-    ranked = seen[np.argsort(every.v_mag[seen], kind="stable")]
+    visible = bench.sprites(q_icrs_to_cam, every).star
+    ranked = visible[np.argsort(every.v_mag[visible], kind="stable")]
     if len(ranked) >= count:
-        kept = every.v_mag <= every.v_mag[ranked[count - 1]]
-        kept[ranked[count:]] = False
-        return BenchmarkScene(_sorted(every, np.flatnonzero(kept), every.vectors[kept]), count)
+        is_shown = every.v_mag <= every.v_mag[ranked[count - 1]]
+        is_shown[ranked[count:]] = False
+        return BenchmarkScene(
+            _sorted(every, np.flatnonzero(is_shown), every.vectors[is_shown]), count
+        )
     vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
     faint = np.flatnonzero(every.v_mag >= np.median(every.v_mag))
     sources = np.concatenate([np.arange(len(every)), rng.choice(faint, len(vectors))])
@@ -131,20 +133,22 @@ def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
 
 def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generator) -> FloatArray:
     """ICRS unit vectors, even over a cap around the view, of which `wanted` are in view."""
-    camera, footprint_px = bench.camera, bench.psf.footprint_px
+    camera = bench.camera
+    footprint_px = bench.psf.footprint_px
     cos_cap = np.cos(min(SKY_BEYOND * camera.field_radius_rad(footprint_px), np.pi))
     tries = 4 * wanted
     while True:
-        z, turn = 1 - rng.uniform(size=tries) * (1 - cos_cap), rng.uniform(0, 2 * np.pi, tries)
+        z = 1 - rng.uniform(size=tries) * (1 - cos_cap)
+        turn = rng.uniform(0, 2 * np.pi, tries)
         across = np.sqrt(1 - z**2)
         vectors = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
         x_px, y_px = camera.project(vectors)
-        seen = pack_sprites(
+        sprites = pack_sprites(
             x_px, y_px, z, np.arange(tries), camera.resolution_px, footprint_px
         ).star
-        if len(seen) >= wanted:
+        if len(sprites) >= wanted:
             return np.asarray(
-                vectors[: seen[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q))
+                vectors[: sprites[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q))
             )
         tries *= 2
 
@@ -153,7 +157,7 @@ def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
     """The methods that are installed here, imported and compiled; and by name the remedy for
     each of the others.
     """
-    found: dict[str, Draw] = {}
+    draws: dict[str, Draw] = {}
     missing: dict[str, str] = {}
     for name, _, make in METHODS:
         try:
@@ -165,8 +169,8 @@ def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
         # lost
         with held():
             draw(FIRST, (0.85, 0.85), (8, 8))
-        found[name] = draw
-    return found, missing
+        draws[name] = draw
+    return draws, missing
 
 
 def numpy_linear(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
@@ -303,7 +307,10 @@ def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: report.Size) -> rep
 def this_machine() -> report.Machine:
     """The processor, and the versions that the times depend on."""
     cpus = Path("/proc/cpuinfo")
-    lines = cpus.read_text(encoding="utf-8").splitlines() if cpus.is_file() else []
+    if cpus.is_file():
+        lines = cpus.read_text(encoding="utf-8").splitlines()
+    else:
+        lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return report.Machine(
         cpu=next(iter(names), platform.machine()),
@@ -322,7 +329,9 @@ class CellMeasurement(Closing):
     def __init__(
         self, bench: Bench, q_icrs_to_cam: FloatArray, cell: report.Cell, result: report.Result
     ) -> None:
-        self.bench, self.q, self.result = bench, q_icrs_to_cam, result
+        self.bench = bench
+        self.q = q_icrs_to_cam
+        self.result = result
         self.cell_key = cell.width, cell.height, cell.stars
         self.shape = cell.height, cell.width
         self.sigma_px = bench.config.render.sprite_sigma_px
@@ -382,31 +391,26 @@ class CellMeasurement(Closing):
             return None
 
         def fastest_s(count: int) -> float:
-            few = {
-                name: getattr(self.sprites, name)[:count]
-                for name in ("data", "star", "x_px", "y_px")
-            }
+            few = {}
+            for name in ("data", "star", "x_px", "y_px"):
+                few[name] = getattr(self.sprites, name)[:count]
             part = replace(self.sprites, **few)
             return min(_seconds(lambda: draw(part, self.sigma_px, self.shape)) for _ in range(2))
 
         one_s = fastest_s(1)
         frame_s = one_s + (fastest_s(101) - one_s) / 100 * len(self.sprites)
-        return (
-            f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
-            if frame_s > budget_s
-            else None
-        )
+        if frame_s > budget_s:
+            return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
+        return None
 
     def _draw_linear(self) -> Float32Array:
         self.linear.draw(self.sprites)
         return self.linear.linear()
 
     def _draw_stages(self) -> None:
-        stars, camera, footprint_px = (
-            self.bench.shown_stars,
-            self.bench.camera,
-            self.staged.footprint_px,
-        )
+        stars = self.bench.shown_stars
+        camera = self.bench.camera
+        footprint_px = self.staged.footprint_px
         begin = time.perf_counter()
         near, directions, rates_e_per_s = self.candidates.near(
             stars, self.icrs_to_image, camera, footprint_px / 2 + 1
@@ -424,7 +428,8 @@ class CellMeasurement(Closing):
 
     def _python(self) -> None:
         """All of a frame that is not OpenGL."""
-        white, size_px = self.bench.flux_at_white_e_per_s, self.bench.camera.resolution_px
+        white = self.bench.flux_at_white_e_per_s
+        size_px = self.bench.camera.resolution_px
         clipped_sprites(
             self.bench.sprites(self.q),
             GaussianPsf(self.sigma_px),
@@ -530,7 +535,10 @@ def run(
     if plan.exposures:
         result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
         result.skipped += without
-    size = report.REFERENCE_PX if report.REFERENCE_PX in plan.sizes else plan.sizes[0]
+    if report.REFERENCE_PX in plan.sizes:
+        size = report.REFERENCE_PX
+    else:
+        size = plan.sizes[0]
     here = [start for start in result.startup if start.size == size]
     for name in ("import_ms", "first_frame_ms", "memory_mb"):
         setattr(result, name, float(np.median([getattr(start, name) for start in here])))
@@ -584,11 +592,10 @@ def _aims(result: report.Result) -> list[report.Aim]:
                     python.ms.median,
                 )
             )
-    starts = [
-        start.import_ms + start.first_frame_ms
-        for start in result.startup
-        if start.size == report.REFERENCE_PX
-    ]
+    starts = []
+    for start in result.startup:
+        if start.size == report.REFERENCE_PX:
+            starts.append(start.import_ms + start.first_frame_ms)
     if starts:
         aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))
     judged = not result.load.busy

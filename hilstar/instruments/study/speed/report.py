@@ -187,18 +187,17 @@ def lines(result: Result) -> Iterator[str]:
 
 
 def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
-    own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
+    own_ms = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
     for row in rows:
         if row is rows[0]:
             yield (
                 f"the virtual tracker, {_words(row.size)}, {row.stars} stars, ms of the processor"
                 " (median)"
             )
-        beside = (
-            ""
-            if row.method == "hilstar"
-            else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
-        )
+        if row.method == "hilstar":
+            beside = ""
+        else:
+            beside = f"   {row.ms.median / own_ms[row.kind]:.2f} of hilstar's"
         yield f"  {row.kind.replace('_', ' '):12}{row.method:11}{row.ms.median:8.1f}{beside}"
     yield from [""] * bool(rows)
 
@@ -224,18 +223,22 @@ def _notes(result: Result) -> Iterator[str]:
                 f" {row.random} random"
             )
     for skipped in result.skipped:
-        where = (
-            ""
-            if skipped.stars is UNSET
-            else f" at {skipped.width} x {skipped.height}, {skipped.stars} stars"
-        )
+        if skipped.stars is UNSET:
+            where = ""
+        else:
+            where = f" at {skipped.width} x {skipped.height}, {skipped.stars} stars"
         yield f"{skipped.method}{where}: {skipped.why}"
     yield (
         f"import {result.import_ms:.0f} ms, first frame {result.first_frame_ms:.0f} ms, "
         f"peak memory {result.memory_mb:.0f} MB, in a fresh process"
     )
     for aim in result.aims:
-        word = "not judged" if aim.reached is None else "reached" if aim.reached else "NOT reached"
+        if aim.reached is None:
+            word = "not judged"
+        elif aim.reached:
+            word = "reached"
+        else:
+            word = "NOT reached"
         yield f"aim {word}: {aim.what} {aim.measured_ms:.2f} ms (at most {aim.aim_ms:.4g})"
 
 
@@ -245,10 +248,11 @@ def write(result: Result, folder: Path) -> None:
     """
     columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
     for name, rows in (("bench.csv", result.rows), ("tracker.csv", result.tracker)):
-        table = [
-            (r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max)
-            for r in rows
-        ]
+        table = []
+        for r in rows:
+            table.append(
+                (r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max)
+            )
         write_csv(folder / name, columns, table)
     _draw(folder / "bench", result)
 
@@ -336,4 +340,8 @@ def _words(size: Size) -> str:
 
 
 def _ms(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.3g}" if value < 100 else f"{value:.0f}"
+    if value is None:
+        return "n/a"
+    if value < 100:
+        return f"{value:.3g}"
+    return f"{value:.0f}"

@@ -39,7 +39,8 @@ class Exposing:
     """The works of the demo's tracker, each with a new noise at every call."""
 
     def __init__(self, file: BenchFile, folder: Path) -> None:
-        self.file, self.folder = file, folder
+        self.file = file
+        self.folder = folder
         self.rng = np.random.default_rng(SEED)
         self.simulator = Simulator(file)
         self.view = self.simulator.view(from_radec_roll_deg(*RADEC_ROLL_DEG), np.zeros(3))
@@ -99,14 +100,14 @@ class Exposing:
         """A campaign's worker on this bench."""
         path = self.folder / "plan.toml"
         plan = parse_plan(path, PLAN)
-        own = (self.file.text, self.file.sha256, files_sha256(plan, self.folder))
+        own_files = (self.file.text, self.file.sha256, files_sha256(plan, self.folder))
         here = str(self.folder)
         return Session(
             Job(
                 str(path),
                 PLAN,
                 str(self.file.path),
-                *own,
+                *own_files,
                 CENTROIDS,
                 here,
                 60.0,
@@ -124,28 +125,28 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
     file = read_bench_file(resource_path("configs", "demo.toml"))
     skipped: list[Skipped] = []
     with TemporaryDirectory() as folder:
-        own = Exposing(file, Path(folder))
-        session = own.session()
+        exposing = Exposing(file, Path(folder))
+        session = exposing.session()
         dimensions = len(session.maker.parameters) + session.maker.attitude_dimensions
         points = np.random.default_rng(SEED).uniform(size=(rounds + 1, dimensions))
 
         def case() -> None:
-            own.case += 1
-            session.row(own.case, points[own.case % len(points)])
+            exposing.case += 1
+            session.row(exposing.case, points[exposing.case % len(points)])
 
         works: dict[tuple[str, str], Work] = {
-            ("hilstar", "exposure"): own.expose,
-            ("numpy", "exposure"): own.numpy_noise,
-            ("hilstar", "find_stars"): lambda: find_stars(own.exposure.dn),
+            ("hilstar", "exposure"): exposing.expose,
+            ("numpy", "exposure"): exposing.numpy_noise,
+            ("hilstar", "find_stars"): lambda: find_stars(exposing.exposure.dn),
             ("hilstar", "case"): case,
             ("hilstar", "verify"): lambda: verify(
                 file, 1, np.random.default_rng(SEED), lambda done: None
             ),
         }
         peers: dict[tuple[str, str], Callable[[], Work]] = {
-            ("galsim", "exposure"): own.galsim_noise,
-            ("photutils", "find_stars"): own.photutils_stars,
-            ("sep", "find_stars"): own.sep_stars,
+            ("galsim", "exposure"): exposing.galsim_noise,
+            ("photutils", "find_stars"): exposing.photutils_stars,
+            ("sep", "find_stars"): exposing.sep_stars,
         }
         for (name, kind), make in peers.items():
             try:
@@ -162,16 +163,16 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
         }
         times = in_turn(by_name, rounds, budget_s)
         width, height = file.config.tracker.resolution_px
-        cell = Cell(width, height, len(own.exposure.truth))
+        cell = Cell(width, height, len(exposing.exposure.truth))
         session.close()
-        own.simulator.close()
+        exposing.simulator.close()
     for name in unset:  # a campaign's worker sets them for its process
         os.environ.pop(name, None)
     rows = []
     for name, kind in sorted(
         works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])
     ):
-        ms = [one.cpu_ms for one in times[f"{name} {kind}"]]
+        ms = [timing.cpu_ms for timing in times[f"{name} {kind}"]]
         spread = Spread(float(np.median(ms)), min(ms), max(ms))
         rows.append(MethodTiming(cell.width, cell.height, cell.stars, name, kind, spread))
     return rows, skipped

@@ -184,7 +184,9 @@ class PhaseErrors:
 
 def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> PhaseErrors:
     """The largest errors of a star's image over sub-pixel phases (n,)."""
-    flux_error, off_px, peak_error = 0.0, 0.0, 0.0
+    flux_error = 0.0
+    off_px = 0.0
+    peak_error = 0.0
     for phase in phases_px:
         image = draw(one_star(256 + phase, 256.0, on))
         light = float(image.sum())
@@ -221,7 +223,8 @@ def narrow_star() -> FailureCase:
 
 def narrow_errors(sigma_px: float) -> tuple[PhaseErrors, PhaseErrors]:
     """The errors of the renderer, and those of point sampling."""
-    on, phases = target(sigma_px), np.linspace(-0.5, 0.5, 21)
+    on = target(sigma_px)
+    phases = np.linspace(-0.5, 0.5, 21)
     with by_renderer(on) as draw:
         return star_errors(draw, on, phases), star_errors(partial(point_sampled, on), on, phases)
 
@@ -287,7 +290,8 @@ def absurd_sigmas() -> FailureCase:
     context = create_context()
     point_px = int(context.info["GL_POINT_SIZE_RANGE"][1])
     context.release()
-    lines, silently_cut = [], NOTHING
+    lines = []
+    silently_cut = NOTHING
     for sigma_px in (60.0, 1e6):
         try:
             Renderer(Target(IMAGE_PX, GaussianPsf((sigma_px, sigma_px)))).close()
@@ -307,7 +311,8 @@ def absurd_sigmas() -> FailureCase:
 
 def star_on_pixel_edge() -> FailureCase:
     """A star where two pixels meet, and a hair to either side."""
-    on, phases = target(SIGMA_PX), np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
+    on = target(SIGMA_PX)
+    phases = np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
     with by_renderer(on) as draw:
         off_px, fault_px = (
             star_errors(by, on, phases).centroid_px for by in (draw, partial(nearest_pixel, on))
@@ -324,7 +329,10 @@ def star_on_pixel_edge() -> FailureCase:
 
 def star_on_image_edge() -> FailureCase:
     """Stars whose centres are on and beyond the image's edges and corner."""
-    errors, faults, last, on = [], [], IMAGE_PX[0] - 1.0, target(SIGMA_PX)
+    errors = []
+    faults = []
+    last = IMAGE_PX[0] - 1.0
+    on = target(SIGMA_PX)
     for x_px, y_px in (
         (-0.5, 256.0),
         (-0.6, 256.0),
@@ -344,7 +352,8 @@ def star_on_image_edge() -> FailureCase:
         with by_renderer(on) as draw:
             errors.append(abs(float(draw(one_star(x_px, y_px, on)).sum()) - exact))
         faults.append(abs(float(inside) - exact))
-    error, fault = max(errors), max(faults)
+    error = max(errors)
+    fault = max(faults)
     return FailureCase(
         "stars on the image's edge",
         "a star drawn whole or not at all, by its centre",
@@ -360,7 +369,8 @@ def many_stars() -> FailureCase:
     rng = np.random.default_rng(SEED)
     x_px, y_px = rng.uniform(10, CROWD_PX[0] - 11, (2, CROWD))
     flux = 10 ** rng.uniform(0, 4, CROWD)
-    on, size = target(SIGMA_PX, CROWD_PX), (CORNER_PX, CORNER_PX)
+    on = target(SIGMA_PX, CROWD_PX)
+    size = (CORNER_PX, CORNER_PX)
     sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), CROWD_PX, on.psf.footprint_px)
     with by_renderer(on) as draw:
         image = draw(sprites)
@@ -376,7 +386,8 @@ def many_stars() -> FailureCase:
         pixel_shares(pixel - place[:, None], SIGMA_PX)
         for pixel, place in ((columns, sprites.x_px), (rows, sprites.y_px))
     )
-    light, indexed = share_y * sprites.data["electrons_per_s"][:, None], np.zeros(CROWD_PX[::-1])
+    light = share_y * sprites.data["electrons_per_s"][:, None]
+    indexed = np.zeros(CROWD_PX[::-1])
     indexed[rows[:, :, None], columns[:, None, :]] += light[:, :, None] * share_x[:, None, :]
     error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, indexed))
     return FailureCase(
@@ -392,7 +403,8 @@ def many_stars() -> FailureCase:
 
 def flux_range() -> FailureCase:
     """Twelve decades side by side."""
-    flux, on = np.array([1e12, 1.0]), target(SIGMA_PX)
+    flux = np.array([1e12, 1.0])
+    on = target(SIGMA_PX)
     stars = [
         one_star(x_px, 256.0, on, light) for x_px, light in zip((100.3, 120.3), flux, strict=True)
     ]
@@ -444,9 +456,11 @@ def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
 
     It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
     """
-    sigma, response = (SIGMA_PX, SIGMA_PX), srgb_response(CODES_BITS)
+    sigma = (SIGMA_PX, SIGMA_PX)
+    response = srgb_response(CODES_BITS)
     flux = flux_ratio(CODES_MAG_UNDER_WHITE) / GaussianPsf(sigma).peak_share
-    on, light = Target(MOVING_PX, GaussianPsf(sigma), response, 1.0, quantisation), []
+    on = Target(MOVING_PX, GaussianPsf(sigma), response, 1.0, quantisation)
+    light = []
     with Renderer(on) as gl:
         for sprites in moving_star(on, flux):
             gl.draw(sprites)
@@ -510,7 +524,8 @@ class CodeScene:
 
 def codes_of(scene: CodeScene, quantisation: Quantisation) -> Levels:
     """The codes (h, w) as hilstar draws them."""
-    panel, sigma_px = scene.panel, (scene.sigma_px, scene.sigma_px)
+    panel = scene.panel
+    sigma_px = (scene.sigma_px, scene.sigma_px)
     on = Target(
         (SIDE_PX, SIDE_PX),
         GaussianPsf(sigma_px),
@@ -591,10 +606,8 @@ def judged(
     case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR
 ) -> FailureCase:
     """Rounding against `exact`, by the light of each group of stars."""
-    fault, error = (
-        error_steps(codes_of(scene, "round"), scene),
-        error_steps(exact_codes(scene), scene),
-    )
+    fault = error_steps(codes_of(scene, "round"), scene)
+    error = error_steps(exact_codes(scene), scene)
     return FailureCase(
         case,
         ROUNDING,
@@ -670,10 +683,8 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
     wanted = scene.wanted()
     corner = slice(2 * TILE_PX), slice(2 * TILE_PX)
     diffused = diffused_light(scene.linear()[corner], scene.panel.response) - wanted[corner]
-    error, fault = (
-        float((shown_light(exact_codes(scene), scene.panel) - wanted).max()),
-        float(diffused.max()),
-    )
+    error = float((shown_light(exact_codes(scene), scene.panel) - wanted).max())
+    fault = float(diffused.max())
     return FailureCase(
         case,
         "error diffusion (Floyd and Steinberg 1976)",
@@ -690,18 +701,18 @@ def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
     next and to those below.
     """
     height, width = linear.shape
-    left = np.zeros((height + 1, width + 2))
-    left[:height, 1:-1] = linear / WHITE
+    remaining = np.zeros((height + 1, width + 2))
+    remaining[:height, 1:-1] = linear / WHITE
     shown = np.zeros((height, width))
     for row in range(height):
         for column in range(1, width + 1):
-            asked = left[row, column]
+            asked = remaining[row, column]
             shown[row, column - 1] = response.light[
                 np.searchsorted(response.threshold, asked, side="right")
             ]
             off = asked - shown[row, column - 1]
-            left[row, column + 1] += off * 7 / 16
-            left[row + 1, column - 1 : column + 2] += off * np.array([3, 5, 1]) / 16
+            remaining[row, column + 1] += off * 7 / 16
+            remaining[row + 1, column - 1 : column + 2] += off * np.array([3, 5, 1]) / 16
     return shown * WHITE
 
 

@@ -154,7 +154,8 @@ def weak_perspectives(directory: Path) -> None:
 
 def ripples(directory: Path) -> None:
     """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
-    on, narrow = image.target(image.SIGMA_PX, image.MOVING_PX), image.target(0.5, image.MOVING_PX)
+    on = image.target(image.SIGMA_PX, image.MOVING_PX)
+    narrow = image.target(0.5, image.MOVING_PX)
     with image.by_renderer(on) as draw:
         linear = image.moving_fluxes(draw, on)
     curves = {

@@ -101,11 +101,9 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     del stack, quick
     # Equal shares of the catalogue, the bluest and the reddest star among them.
     bv_mag = np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
-    optics, photometry, temperature = (
-        study_optics(SENSOR),
-        electrons.Photometry(),
-        SkySettings().temperature,
-    )
+    optics = study_optics(SENSOR)
+    photometry = electrons.Photometry()
+    temperature = SkySettings().temperature
     kelvin = electrons.star_temperatures_k(bv_mag, temperature)
 
     def by_rule(rule: Rule) -> FloatArray:
@@ -142,7 +140,8 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     works |= {name: partial(by_table, degree) for degree, name in tables.items()}
     works |= {f"straight lines over B-V, {n}": partial(by_colour, n) for n in BV_TABLE_SIZES}
     works["AGS"] = lambda: np.full(COLOURS, electrons.ags_electrons_per_s(optics, photometry))
-    exact, trials = adaptive_rates(kelvin, optics), []
+    exact = adaptive_rates(kelvin, optics)
+    trials = []
     for name, work in works.items():
         error = np.abs(magnitude(work() / exact))
         figures = float(error.max()), float(np.median(error))
@@ -187,10 +186,8 @@ def _rates(
     """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one
     tolerance fits all stars.
     """
-    passband, curves = (
-        load_curve("johnson-v", "johnson-v"),
-        (optics.quantum_efficiency, optics.transmission),
-    )
+    passband = load_curve("johnson-v", "johnson-v")
+    curves = (optics.quantum_efficiency, optics.transmission)
     scale = blackbody_exitance_w_m2_m(np.array([550.0]), kelvin[:, None])
 
     def spectrum(nm: FloatArray) -> FloatArray:
@@ -232,7 +229,8 @@ def gauss(order: int, *curves: Curve) -> tuple[FloatArray, FloatArray]:
 
 def shared_knots(*curves: Curve) -> FloatArray:
     """Knots of all curves, nm, within the range that they share."""
-    low, high = max(c.wavelength_nm[0] for c in curves), min(c.wavelength_nm[-1] for c in curves)
+    low = max(c.wavelength_nm[0] for c in curves)
+    high = min(c.wavelength_nm[-1] for c in curves)
     knots = np.unique(np.concatenate([c.wavelength_nm for c in curves]))
     return np.asarray(knots[(knots >= low) & (knots <= high)])
 
@@ -242,16 +240,14 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     2.5.
     """
     del stack, quick
-    library, optics = electrons.load_library(), study_optics(SENSOR)
-    exact, zero = (
-        electrons.library_electrons_per_s(library, optics, electrons.Photometry()),
-        np.zeros(len(library.spectral_type)),
-    )
-    sure, sky = library.vi_mag < MAX_RELIABLE_VI_MAG, SkySettings()
-    real, bodies = (
-        electrons.tabulate_pickles(optics, electrons.Photometry()),
-        electrons.tabulate("dgs", optics, electrons.Photometry()),
-    )
+    library = electrons.load_library()
+    optics = study_optics(SENSOR)
+    exact = electrons.library_electrons_per_s(library, optics, electrons.Photometry())
+    zero = np.zeros(len(library.spectral_type))
+    sure = library.vi_mag < MAX_RELIABLE_VI_MAG
+    sky = SkySettings()
+    real = electrons.tabulate_pickles(optics, electrons.Photometry())
+    bodies = electrons.tabulate("dgs", optics, electrons.Photometry())
     average = electrons.tabulate("ags", optics, electrons.Photometry())
 
     def trial(
@@ -341,21 +337,21 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
 
 def splat_variants() -> dict[str, SplatVariant]:
     """The GPU's ways, by name; the renderer's own is the `SplatVariant()` that changes nothing."""
-    own = SPRITE_PSF.footprint_px
-    variants = {f"GL polynomial, R32F, {own} px": SplatVariant()}
+    footprint_px = SPRITE_PSF.footprint_px
+    variants = {f"GL polynomial, R32F, {footprint_px} px": SplatVariant()}
     variants |= {
         f"GL polynomial, R32F, {size} px": SplatVariant(footprint_px=size)
         for size in SIZES_PX
-        if size != own
+        if size != footprint_px
     }
-    variants |= {f"GL polynomial, R16F, {own} px": SplatVariant(half_float=True)}
-    variants |= {f"GL erf, {own} px": SplatVariant("erf")}
-    variants |= {f"GL erf by exp, {own} px": SplatVariant("exp erf")}
+    variants |= {f"GL polynomial, R16F, {footprint_px} px": SplatVariant(half_float=True)}
+    variants |= {f"GL erf, {footprint_px} px": SplatVariant("erf")}
+    variants |= {f"GL erf by exp, {footprint_px} px": SplatVariant("exp erf")}
     variants |= {
-        f"GL table of {size}, {own} px": SplatVariant("table", table_size=size)
+        f"GL table of {size}, {footprint_px} px": SplatVariant("table", table_size=size)
         for size in TABLE_SIZES
     }
-    variants |= {f"GL pixel centre, {own} px": SplatVariant("centre")}
+    variants |= {f"GL pixel centre, {footprint_px} px": SplatVariant("centre")}
     return variants
 
 
@@ -368,13 +364,15 @@ def _psf_errors(size_px: int, image: Callable[[FrameLight], FloatArray]) -> tupl
         (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
     )
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
-    flux, star = np.full(PSF_PHASES**2, WHITE / SPRITE_PSF.peak_share), np.arange(PSF_PHASES**2)
+    flux = np.full(PSF_PHASES**2, WHITE / SPRITE_PSF.peak_share)
+    star = np.arange(PSF_PHASES**2)
     sprites = pack_sprites(x_px, y_px, flux, star, (side, side), size_px)
     bright = linear_image(sprites, (side, side), SPRITE_PSF, TILE_PX)
-    errors = [
-        measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX)
-        for mag in (0.0, FAINTER_MAG)
-    ]
+    errors = []
+    for mag in (0.0, FAINTER_MAG):
+        errors.append(
+            measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX)
+        )
     return max(e.flux_max_mag for e in errors), max(e.centroid_max_px for e in errors)
 
 
@@ -384,16 +382,25 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
     """
     del quick  # every error is found at once
     bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
-    mag, stealing, trials = AIMS[bits][1], RenderSettings().bit_stealing, []
+    mag = AIMS[bits][1]
+    stealing = RenderSettings().bit_stealing
+    trials = []
     for way in WAYS:
-        found = code_errors(bits, way, PHASES, [mag])[0]
+        code_error = code_errors(bits, way, PHASES, [mag])[0]
         target = Target(FRAME_PX, SPRITE_PSF, response_of(bits, way), WHITE, way.method)
         renderer = stack.enter_context(Renderer(target))
         work = partial(_codes, renderer, star_field(FRAME_PX, renderer.footprint_px), count())
-        each = {f"max_px_{kind}": found.max_px(kind) for kind in FAMILY}
+        max_px_by_kind = {f"max_px_{kind}": code_error.max_px(kind) for kind in FAMILY}
         is_default = (way.method, way.stealing) == (TAKEN, stealing)
         trials.append(
-            Trial(way.name, found.flux_max_mag, found.max_px(JUDGE), work, is_default, more=each)
+            Trial(
+                way.name,
+                code_error.flux_max_mag,
+                code_error.max_px(JUDGE),
+                work,
+                is_default,
+                more=max_px_by_kind,
+            )
         )
     taken = next(trial for trial in trials if trial.is_default)
     by_each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
@@ -421,16 +428,17 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
     the field.
     """
     del quick
-    config, camera = demo_config(), ideal_monitor(demo_config())
+    config = demo_config()
+    camera = ideal_monitor(demo_config())
     every = stars_to(NO_LIMIT_V_MAG)
-    response, white = (
-        bench_calibration(config, Path()).response,
-        brightest_peak_e_per_s(every, SPRITE_PSF),
-    )
+    response = bench_calibration(config, Path()).response
+    white = brightest_peak_e_per_s(every, SPRITE_PSF)
     renderer = stack.enter_context(
         Renderer(Target(camera.resolution_px, SPRITE_PSF, response, white))
     )
-    default, turn, trials = SkySettings().faintest_v_mag, turn_to_image(ORION, camera), []
+    default = SkySettings().faintest_v_mag
+    turn = turn_to_image(ORION, camera)
+    trials = []
 
     def frame(stars: Stars) -> None:
         renderer.draw(make_sprites(stars, turn, camera, renderer.footprint_px))
@@ -438,13 +446,15 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
 
     for limit in sorted({*LIMITS_V_MAG, default, NO_LIMIT_V_MAG}):
         stars = stars_to(limit)
-        lost = (
-            100 * (1 - stars.electrons_per_s.sum() / every.electrons_per_s.sum())
-            if len(stars) < len(every)
-            else 0.0
-        )
+        if len(stars) < len(every):
+            lost = 100 * (1 - stars.electrons_per_s.sum() / every.electrons_per_s.sum())
+        else:
+            lost = 0.0
         drawn = len(make_sprites(stars, turn, camera, renderer.footprint_px))
-        name = "all of Hipparcos" if limit == NO_LIMIT_V_MAG else f"V to {limit:g}"
+        if limit == NO_LIMIT_V_MAG:
+            name = "all of Hipparcos"
+        else:
+            name = f"V to {limit:g}"
         trials.append(
             Trial(
                 name, lost, drawn, partial(frame, stars), limit == default, limit == NO_LIMIT_V_MAG

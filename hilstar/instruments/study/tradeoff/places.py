@@ -101,7 +101,8 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     tested that are not in view.
     """
     del stack
-    camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
+    camera = ideal_monitor(demo_config())
+    stars = stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(10 if quick else ATTITUDES, camera)
 
     def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
@@ -122,15 +123,16 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     }
     trials = []
     for name, (sorted_stars, finder) in finders.items():
-        missed, vain = 0, 0
+        missed = 0
+        vain = 0
         for turn, wanted in zip(turns, in_view, strict=True):
-            seen, looked_at = finder(sorted_stars, turn, camera)
-            shown = set(sorted_stars.hip[seen].tolist())
+            visible, looked_at = finder(sorted_stars, turn, camera)
+            shown = set(sorted_stars.hip[visible].tolist())
             missed += len(wanted - shown)
             vain += looked_at - len(wanted & shown)
         work = partial(finder, sorted_stars, turns[0], camera)
-        own = name == f"cells of {CELL_DEG:g} deg"
-        trials.append(Trial(name, missed, vain / len(turns), work, own, finder is _scan))
+        is_own = name == f"cells of {CELL_DEG:g} deg"
+        trials.append(Trial(name, missed, vain / len(turns), work, is_own, finder is _scan))
     return Trials(
         "culling",
         f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion",
@@ -184,7 +186,8 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     ATTITUDES random fields.
     """
     del stack
-    camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
+    camera = ideal_monitor(demo_config())
+    stars = stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(6 if quick else ATTITUDES, camera)
     near = [stars.vectors[stars.grid.near(turn[2], camera.field_radius_rad(0.0))] for turn in turns]
     truths = [
@@ -192,10 +195,10 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     ]
     trials = []
     for name, road in ROADS.items():
-        found = [
+        places = [
             _places(road, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)
         ]
-        error = np.hypot(*(np.concatenate(found) - np.concatenate(truths)).T).astype(np.float64)
+        error = np.hypot(*(np.concatenate(places) - np.concatenate(truths)).T).astype(np.float64)
         error = error[np.isfinite(error)]
         work = partial(road.pack, near[0], turns[0], camera)
         # The sprites' own layout says which of them the renderer is handed.
@@ -231,7 +234,8 @@ class Road:
         x, y, z = (vectors.astype(kind, copy=False) @ icrs_to_image.T.astype(kind)).T
         scale = kind(camera.focal_length_px) / z
         cx, cy = (kind(c) for c in camera.principal_point_px)
-        x, y = x * scale + cx, y * scale + cy
+        x = x * scale + cx
+        y = y * scale + cy
         star, (width, height), side = (
             np.arange(len(vectors)),
             camera.resolution_px,
@@ -241,11 +245,11 @@ class Road:
             sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side)
             return sprites.data, sprites.star
         margin = side / 2
-        seen = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
-        data = np.empty(np.count_nonzero(seen), dtype=self.dtype)
-        data["place_px"][:, 0], data["place_px"][:, 1] = x[seen], y[seen]
+        is_visible = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
+        data = np.empty(np.count_nonzero(is_visible), dtype=self.dtype)
+        data["place_px"][:, 0], data["place_px"][:, 1] = x[is_visible], y[is_visible]
         data["electrons_per_s"] = 1.0
-        return data, star[seen]
+        return data, star[is_visible]
 
 
 def _layout(place: type[np.floating[Any]]) -> np.dtype[np.void]:
@@ -292,7 +296,8 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     """
     across = STARS_ACROSS // 2 if quick else STARS_ACROSS
     motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), TRACKER.exposure_s)
-    few, many = grid_stars(across, motion), grid_stars(STARS_ACROSS, motion)
+    few = grid_stars(across, motion)
+    many = grid_stars(STARS_ACROSS, motion)
     renderer = stack.enter_context(
         VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant())
     )
@@ -321,13 +326,12 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     }
     methods |= {name: partial(gauss, count) for count, name in names.items()}
     methods |= {f"evenly in time, {count}": partial(evenly, count) for count in EVENLY}
-    exact, trials = image(gauss(EXACT_NODES, few)), []
+    exact = image(gauss(EXACT_NODES, few))
+    trials = []
     for name, sprites_of in methods.items():
         drawn = image(sprites_of(few))
-        worst, off_px = (
-            float(np.abs(drawn - exact).max()),
-            measure(exact, drawn, len(exact) // across).centroid_max_px,
-        )
+        worst = float(np.abs(drawn - exact).max())
+        off_px = measure(exact, drawn, len(exact) // across).centroid_max_px
         trials.append(
             Trial(
                 name,
@@ -380,8 +384,10 @@ def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> F
 
 def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Places (k, n), px, at the parts `at` (k,) of the exposure, 0 its middle."""
-    seen = stars.vectors @ motion.icrs_to_image(at * motion.exposure_s, CAMERA).transpose(0, 2, 1)
-    x_px, y_px = CAMERA.project(seen.reshape(-1, 3))
+    image_directions = stars.vectors @ motion.icrs_to_image(
+        at * motion.exposure_s, CAMERA
+    ).transpose(0, 2, 1)
+    x_px, y_px = CAMERA.project(image_directions.reshape(-1, 3))
     return x_px.reshape(len(at), -1), y_px.reshape(len(at), -1)
 
 
@@ -397,7 +403,8 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
     frames_ns = (
         np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns
     ).tolist()
-    frame_ns, trials = NS_PER_S / FRAME_HZ, []
+    frame_ns = NS_PER_S / FRAME_HZ
+    trials = []
     for predictor in predictors():
         errors = []
         for after in range(NEAR, len(samples)):

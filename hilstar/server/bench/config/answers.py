@@ -208,11 +208,11 @@ def check_answers(settings: AnswersSettings) -> None:
             raise InputError(
                 f'trust = ["{shortened(package)}"]: no name of a package; write what `import` takes'
             )
-    for wrong, said in chain(
+    for wrong, fault in chain(
         _road_faults(settings), _frame_faults(settings) if of_frame else _format_faults(settings)
     ):
         if wrong:
-            raise InputError(said)
+            raise InputError(fault)
     if settings.connect is not None:
         host_and_port(settings.connect)
     elif settings.source == "udp" or settings.listen is not None:
@@ -222,11 +222,11 @@ def check_answers(settings: AnswersSettings) -> None:
 def _road_faults(settings: AnswersSettings) -> Faults:
     source = settings.source
     for key, roads in ROADS.items():
-        said = " or ".join(f'"{road}"' for road in roads)
+        roads_text = " or ".join(f'"{road}"' for road in roads)
         given = getattr(settings, key) not in {None, "", ()}
         yield (
             given and source not in roads,
-            f'{key} is for source = {said}; remove it (source = "{source}")',
+            f'{key} is for source = {roads_text}; remove it (source = "{source}")',
         )
     no_device = source == "serial" and (not settings.port or isinstance(settings.port, int))
     yield no_device, 'source = "serial" needs port; write port = "/dev/ttyUSB0" or the like'
@@ -234,9 +234,9 @@ def _road_faults(settings: AnswersSettings) -> Faults:
         source == "file" and not settings.path,
         'source = "file" needs path; write path = "tracker.bin" or the like',
     )
-    one = (settings.connect is None) != (settings.listen is None)
+    is_one_end = (settings.connect is None) != (settings.listen is None)
     yield (
-        source == "tcp" and not one,
+        source == "tcp" and not is_one_end,
         f'source = "tcp" needs connect or listen, one of them; {PLACE_FORM}',
     )
     asked = settings.poll_hex is not None
@@ -273,7 +273,9 @@ def _format_faults(settings: AnswersSettings) -> Faults:
 
 
 def _frame_faults(settings: AnswersSettings) -> Faults:
-    framing, length, form = settings.framing, settings.length, 'format = "frame"'
+    framing = settings.framing
+    length = settings.length
+    form = 'format = "frame"'
     yield (
         framing is None,
         f'{form} needs framing; write framing = "sync", "slip", "cobs", "fixed" or "ccsds"',

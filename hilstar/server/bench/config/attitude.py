@@ -176,10 +176,8 @@ def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
                 " remove it"
             )
         return bound_place("127.0.0.1:0", "", None), AllowedSenders(())
-    place, allowed = (
-        bound_place(settings.bind, settings.port, settings.endpoint),
-        AllowedSenders(settings.allow),
-    )
+    place = bound_place(settings.bind, settings.port, settings.endpoint)
+    allowed = AllowedSenders(settings.allow)
     if not allowed and not place.loopback:
         raise InputError(
             f"{place} is open to other machines, and allow does not say which may send;"
@@ -190,7 +188,8 @@ def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
 
 def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
     """The number of 42's spacecraft, and who may connect. Raises InputError as `udp_road` does."""
-    place, allowed = parse_endpoint(settings.address), AllowedSenders(settings.allow)
+    place = parse_endpoint(settings.address)
+    allowed = AllowedSenders(settings.allow)
     if settings.bind is True and not allowed and not place.loopback:
         raise InputError(
             f"{settings.address} is open to other machines, and allow does not say which may send;"

@@ -162,7 +162,9 @@ def today(config: BenchConfig) -> BenchConfig:
     """The configuration with stars of the present day, by this machine's clock, where t_ns
     counts from 1970.
     """
-    return _on_day(config, UNIX, time.time_ns()) if config.sky.epoch_utc == UNIX else config
+    if config.sky.epoch_utc == UNIX:
+        return _on_day(config, UNIX, time.time_ns())
+    return config
 
 
 def _on_day(config: BenchConfig, epoch_utc: str, utc_ns: int) -> BenchConfig:
@@ -226,7 +228,8 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
         config = _converted(tables)
         _check_meaning(config)
         _check_sky(config, tables)
-        render, sky = config.render, config.sky
+        render = config.render
+        sky = config.sky
         # A bench's hash covers the default white, and the Julian year of `epoch_utc`.
         if render.flux_at_white_e_per_s is None and render.brightest_v_mag is None:
             render = msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG)
@@ -283,7 +286,8 @@ def _check_meaning(config: BenchConfig) -> None:
                 f"[{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million"
                 f" pixels; write {MAX_AREA_PX / 1e6:.0f} million at most, such as [8192, 8192]"
             )
-    render, faults = config.render, config.faults
+    render = config.render
+    faults = config.faults
     if render.flux_at_white_e_per_s is not None and render.brightest_v_mag is not None:
         raise InputError(
             "[render] has flux_at_white_e_per_s and brightest_v_mag; write one of them"
@@ -346,8 +350,13 @@ def _check_frames(config: BenchConfig) -> None:
 
 
 def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
-    sky, background, attitude = config.sky, config.background, config.attitude
-    room_km_s = MAX_SPEED_KM_S if attitude.source == "vizard" else 0.0
+    sky = config.sky
+    background = config.background
+    attitude = config.attitude
+    if attitude.source == "vizard":
+        room_km_s = MAX_SPEED_KM_S
+    else:
+        room_km_s = 0.0
     if math.hypot(*sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
         raise InputError(
             "[sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z"
@@ -384,7 +393,10 @@ def _check_site(config: BenchConfig) -> None:
     if config.site is None:
         return
     if config.spacecraft.orbit is not None or config.sky.bodies.earth:
-        other = "[sky.bodies] earth" if config.spacecraft.orbit is None else "[spacecraft] orbit"
+        if config.spacecraft.orbit is None:
+            other = "[sky.bodies] earth"
+        else:
+            other = "[spacecraft] orbit"
         raise InputError(
             f"[site] is a place on the ground, and {other} is seen from above it; leave one of"
             " them out"
@@ -397,7 +409,8 @@ def _check_site(config: BenchConfig) -> None:
 
 
 def _check_orbit(config: BenchConfig) -> None:
-    attitude, orbit = config.attitude, config.spacecraft.orbit
+    attitude = config.attitude
+    orbit = config.spacecraft.orbit
     if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
         raise InputError(
             "[sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit"

@@ -163,7 +163,7 @@ class Tracker(Table, frozen=True):
         """
         given = {
             key: getattr(self, key)
-            for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb"))
+            for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb"))
         }
         return {key: value for key, value in given.items() if value is not None}
 
@@ -171,14 +171,16 @@ class Tracker(Table, frozen=True):
 def check_channels(tracker: Tracker) -> None:
     """Refuse (InputError) a tracker with neither one quantum efficiency nor three."""
     given = tracker.quantum_efficiencies
-    missing = [key for key in (f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb") if key not in given]
+    missing = [
+        key for key in (f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb") if key not in given
+    ]
     if QUANTUM_EFFICIENCY in given and len(given) > 1:
         raise InputError(
             f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or"
             " _r, _g and _b"
         )
     if tracker.detector.bayer is not None and QUANTUM_EFFICIENCY in given:
-        three = ", ".join(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb")
+        three = ", ".join(f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb")
         raise InputError(
             f'[tracker.detector] bayer = "{tracker.detector.bayer}" has three colours of pixels,'
             f" and [tracker] one {QUANTUM_EFFICIENCY}; write {three} in its place, or leave"
@@ -294,12 +296,16 @@ class Monitor(Table, frozen=True):
     @property
     def panel_scanout_ms(self) -> float:
         """`scanout_ms`, or its default."""
-        return self.period_ms if self.scanout_ms is None else self.scanout_ms
+        if self.scanout_ms is None:
+            return self.period_ms
+        return self.scanout_ms
 
     @property
     def panel_hold_ms(self) -> float:
         """`hold_ms`, or its default."""
-        return self.period_ms if self.hold_ms is None else self.hold_ms
+        if self.hold_ms is None:
+            return self.period_ms
+        return self.hold_ms
 
 
 class Collimator(Table, frozen=True):
@@ -417,4 +423,6 @@ class Verify(Table, frozen=True):
     @property
     def judge(self) -> Literal["window", "wide", "moment", "fit", "box3", "box5"] | None:
         """`centroider` where a star is a Gaussian."""
-        return "fit" if self.centroider == "psf" else self.centroider
+        if self.centroider == "psf":
+            return "fit"
+        return self.centroider

@@ -92,16 +92,20 @@ def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 def table_in(hint: Any) -> type[msgspec.Struct] | None:
     """The table that a key is, or may be (`X | None`); None for any other key."""
     kind = plain(hint)
-    parts = (
-        [part for part in get_args(kind) if part is not type(None)] if is_optional(kind) else [kind]
-    )
+    if is_optional(kind):
+        parts = [part for part in get_args(kind) if part is not type(None)]
+    else:
+        parts = [kind]
     only = parts[0] if len(parts) == 1 else None
-    return only if isinstance(only, type) and issubclass(only, msgspec.Struct) else None
+    if isinstance(only, type) and issubclass(only, msgspec.Struct):
+        return only
+    return None
 
 
 def section(name: str, table: Any, notes: str) -> str:
     """A table of the file: what it is for, its keys, and what else there is to know."""
-    hints, meanings = get_type_hints(table, include_extras=True), meanings_of(table)
+    hints = get_type_hints(table, include_extras=True)
+    meanings = meanings_of(table)
     keys = [field for field in msgspec.structs.fields(table) if table_in(field.type) is None]
     rows = [row(field, hints[field.name], meanings[field.name]) for field in keys]
     lines = [
@@ -124,14 +128,14 @@ def meanings_of(table: type) -> dict[str, str]:
             first = key.lineno - 1
             while lines[first - 1].lstrip().startswith("#:"):
                 first -= 1
-            told = " ".join(
+            meaning = " ".join(
                 line.partition("#:")[2].strip()
                 for line in lines[first : key.end_lineno]
                 if "#:" in line
             )
-            for name, words in FILLED_IN.items():
-                told = told.replace(f"{{{name}}}", words)
-            meanings[key.target.id] = told
+            for name, filling in FILLED_IN.items():
+                meaning = meaning.replace(f"{{{name}}}", filling)
+            meanings[key.target.id] = meaning
     return meanings
 
 
@@ -167,26 +171,25 @@ def is_optional(kind: Any) -> bool:
 
 def value_text(name: str, hint: Any) -> str:
     """The values of a key: its choices, or its form, limits and unit."""
-    kind, notes = plain(hint), notes_of(hint)
-    choices = (
-        tuple(plain(choice) for choice in get_args(kind) if choice is not type(None))
-        if is_optional(kind)
-        else ()
-    )
+    kind = plain(hint)
+    notes = notes_of(hint)
+    if is_optional(kind):
+        choices = tuple(plain(choice) for choice in get_args(kind) if choice is not type(None))
+    else:
+        choices = ()
     if len(choices) == 1:
         (kind,) = choices
     if get_origin(kind) is Literal:
         return ", ".join(f"`{toml(choice)}`" for choice in get_args(kind))
     form = next((note.extra["form"] for note in notes if note.extra and "form" in note.extra), None)
-    words = (
-        f"`{form}`"
-        if form
-        else " or ".join(
+    if form:
+        forms = f"`{form}`"
+    else:
+        forms = " or ".join(
             TYPE_WORDS[choice.__name__] for choice in choices or get_args(kind) or (kind,)
         )
-    )
     unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
-    return ", ".join(part for part in (words, limits_text(notes), unit) if part)
+    return ", ".join(part for part in (forms, limits_text(notes), unit) if part)
 
 
 def limits_text(notes: list[Meta]) -> str:
@@ -195,8 +198,13 @@ def limits_text(notes: list[Meta]) -> str:
     high = next((note.le for note in notes if note.le is not None), None)
     if low is None:
         return ""
-    above = "above 0" if low == MIN_POSITIVE else f"{low:g} or more"
-    return above if high is None or high >= MAX_NUMBER else f"{low:g} to {high:.12g}"
+    if low == MIN_POSITIVE:
+        above = "above 0"
+    else:
+        above = f"{low:g} or more"
+    if high is None or high >= MAX_NUMBER:
+        return above
+    return f"{low:g} to {high:.12g}"
 
 
 def toml(value: Any) -> str:

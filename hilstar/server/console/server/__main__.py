@@ -138,7 +138,8 @@ async def run(
 ) -> None:
     """Serve until the run has ended."""
     scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
-    reader, pages = RunReader(memory, setup), OpenPages()
+    reader = RunReader(memory, setup)
+    pages = OpenPages()
     page = Page(setup, reader, pages, None if scene is None else scene.sky, channel.give)
     config = uvicorn.Config(
         page.app(),

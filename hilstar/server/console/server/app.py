@@ -78,7 +78,8 @@ class Refused(Exception):
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
-        self.status, self.line = status, line
+        self.status = status
+        self.line = line
 
 
 class Guard:
@@ -97,7 +98,9 @@ class Guard:
             if ":" not in name
             for port in ("", ":443", ":80", f":{setup.port}")
         }
-        self._any_address, self._port, self._token = setup.any_address, setup.port, setup.token
+        self._any_address = setup.any_address
+        self._port = setup.port
+        self._token = setup.token
 
     def check_host(self, host: str) -> None:
         """Raises Refused (421) for a name that is not the page's."""
@@ -124,7 +127,8 @@ class Guard:
 
     def check_origin(self, headers: Mapping[str, str]) -> None:
         """Raises Refused (403) for a request that another site's page made."""
-        origin, host = headers.get("origin"), headers.get("host", "").lower()
+        origin = headers.get("origin")
+        host = headers.get("host", "").lower()
         if origin is not None and origin.lower() not in {f"http://{host}", f"https://{host}"}:
             raise Refused(403, "another site's page may not ask here")
         if (
@@ -140,7 +144,10 @@ class Guard:
         if not self._token:
             return
         scheme, _, given = headers.get("authorization", "").partition(" ")
-        tokens = [given.strip()] if scheme.lower() == "bearer" else []
+        if scheme.lower() == "bearer":
+            tokens = [given.strip()]
+        else:
+            tokens = []
         tokens += [
             name.removeprefix(TOKEN_PROTOCOL)
             for name in protocols
@@ -180,7 +187,7 @@ class RunCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics with their current values."""
-        hello, seen, health = (
+        hello, state, health = (
             self._reader.setup.hello,
             self._reader.seen or RunState(host_ns=0),
             self._reader.health,
@@ -189,9 +196,9 @@ class RunCollector(Collector):
             key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")
         }
         yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
-        counts, clock, ledger, pacing = seen.counts, seen.clock, seen.ledger, self._reader.pacing
-        age_ms = None if seen.attitude is None else seen.attitude.age_ms
-        for name, words, count in (
+        counts, clock, ledger, pacing = state.counts, state.clock, state.ledger, self._reader.pacing
+        age_ms = None if state.attitude is None else state.attitude.age_ms
+        for name, help_text, count in (
             ("frames", "Frames shown.", counts.frames),
             ("frames_missed", "Refresh periods without a frame of their own.", counts.missed),
             ("frames_stale", "Frames shown with a stale attitude.", counts.stale),
@@ -206,9 +213,9 @@ class RunCollector(Collector):
                 "Attitude packets that never came, by gaps of their sequence.",
                 counts.lost,
             ),
-            ("wrong_sky_seconds", "Seconds in which the sky shown was wrong.", seen.wrong_sky_s),
+            ("wrong_sky_seconds", "Seconds in which the sky shown was wrong.", state.wrong_sky_s),
         ):
-            yield CounterMetricFamily(f"hilstar_{name}", words, value=count)
+            yield CounterMetricFamily(f"hilstar_{name}", help_text, value=count)
         refused = CounterMetricFamily(
             "hilstar_packets_refused", "Attitude packets refused.", labels=["reason"]
         )
@@ -218,19 +225,19 @@ class RunCollector(Collector):
         wrong = GaugeMetricFamily(
             "hilstar_wrong_sky", "1 while the sky shown is wrong, by kind.", labels=["kind"]
         )
-        lasting = {condition.kind for condition in seen.wrong_sky}
+        lasting = {condition.kind for condition in state.wrong_sky}
         for kind in ENDS:
             wrong.add_metric([kind], float(kind in lasting))
         yield wrong
-        tracker = seen.tracker
+        tracker = state.tracker
         if tracker is not None:
             yield from tracker_metrics(tracker)
         # in units of the last; None is left out
         gauges: list[tuple[str, str, float | None, float]] = [
             ("healthy", "1 while the sky is right, as GET /health has it.", health.ok, 1),
             ("health_since_timestamp_seconds", "Since when that is so.", health.since_s, 1),
-            ("attitude_missing", "1 until an attitude has come.", seen.frame.missing, 1),
-            ("attitude_stale", "1 while the attitude is stale.", seen.frame.stale, 1),
+            ("attitude_missing", "1 until an attitude has come.", state.frame.missing, 1),
+            ("attitude_stale", "1 while the attitude is stale.", state.frame.stale, 1),
             ("attitude_age_seconds", "Age of the attitude of the newest frame.", age_ms, 1e-3),
             (
                 "clock_offset_seconds",
@@ -250,18 +257,18 @@ class RunCollector(Collector):
                 None if clock is None else clock.drift_ppm,
                 1e-6,
             ),
-            ("stars", "Stars in the newest frame.", seen.frame.stars, 1),
+            ("stars", "Stars in the newest frame.", state.frame.stars, 1),
             (
                 "stars_clipped",
                 "Those brighter than the monitor's white.",
-                len(seen.frame.clipped),
+                len(state.frame.clipped),
                 1,
             ),
-            ("display_lost", "1 where the display has gone.", bool(seen.display_lost), 1),
+            ("display_lost", "1 where the display has gone.", bool(state.display_lost), 1),
             (
                 "operator_override",
                 "1 while an operator changes the sky.",
-                bool(seen.operator_text),
+                bool(state.operator_text),
                 1,
             ),
             ("ledger_bytes", "Size of the ledger.", None if ledger is None else ledger.bytes, 1),
@@ -279,13 +286,13 @@ class RunCollector(Collector):
             ),
             ("console_clients", "Pages that are open.", self.clients, 1),
         ]
-        for name, words, value, unit in gauges:
+        for name, help_text, value, unit in gauges:
             if value is not None:
-                yield GaugeMetricFamily(f"hilstar_{name}", words, value=float(value * unit))
+                yield GaugeMetricFamily(f"hilstar_{name}", help_text, value=float(value * unit))
         if pacing is not None:
-            words = "Between frames, over the last minute."
+            help_text = "Between frames, over the last minute."
             intervals = GaugeMetricFamily(
-                "hilstar_frame_interval_seconds", words, labels=["quantile"]
+                "hilstar_frame_interval_seconds", help_text, labels=["quantile"]
             )
             for quantile, interval_ms in (("0.5", pacing.p50_ms), ("0.99", pacing.p99_ms)):
                 intervals.add_metric([quantile], interval_ms * 1e-3)
@@ -306,19 +313,19 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
     for reason, count in found.refused.items():
         refused.add_metric([reason], count)
     yield refused
-    words = "Answers whose stamp is before an earlier answer's."
-    yield CounterMetricFamily("hilstar_tracker_out_of_order", words, value=found.out_of_order)
-    for name, words, values in (
+    help_text = "Answers whose stamp is before an earlier answer's."
+    yield CounterMetricFamily("hilstar_tracker_out_of_order", help_text, value=found.out_of_order)
+    for name, help_text, values in (
         ("residual", "Of the newest answer.", found.residual_arcsec),
         ("residual_rms", "Of the last minute's right answers.", found.rms_arcsec),
         ("residual_sigma3", "Three standard deviations of them.", found.sigma3_arcsec),
     ):
         if values is not None:
-            gauge = GaugeMetricFamily(f"hilstar_tracker_{name}_arcsec", words, labels=["axis"])
+            gauge = GaugeMetricFamily(f"hilstar_tracker_{name}_arcsec", help_text, labels=["axis"])
             for axis, value in zip("xyz", values, strict=True):
                 gauge.add_metric([axis], value)
             yield gauge
-    for name, words, figure, unit in (
+    for name, help_text, figure, unit in (
         (
             "availability_ratio",
             "Right answers of the last minute over those due.",
@@ -331,7 +338,9 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
         ("trouble", "1 while something is wrong with the tracker's line.", bool(found.trouble), 1),
     ):
         if figure is not None:
-            yield GaugeMetricFamily(f"hilstar_tracker_{name}", words, value=float(figure * unit))
+            yield GaugeMetricFamily(
+                f"hilstar_tracker_{name}", help_text, value=float(figure * unit)
+            )
 
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
@@ -345,8 +354,12 @@ class Page:
     def __init__(
         self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give
     ) -> None:
-        self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
-        self.guard, self.metrics = Guard(setup), RunCollector(reader)
+        self.setup = setup
+        self.reader = reader
+        self.pages = pages
+        self.give = give
+        self.guard = Guard(setup)
+        self.metrics = RunCollector(reader)
         self._sky = b"{}" if sky is None else msgspec.json.encode(sky)
         self._files = {
             path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES
@@ -378,9 +391,9 @@ class Page:
         return Response(data, media_type=TYPES[Path(name).suffix])
 
     async def _health(self, _: Request) -> Response:
-        found = self.reader.health_now()
+        health = self.reader.health_now()
         return Response(
-            msgspec.json.encode(found), 200 if found.ok else 503, media_type="application/json"
+            msgspec.json.encode(health), 200 if health.ok else 503, media_type="application/json"
         )
 
     async def _metrics(self, _: Request) -> Response:
@@ -450,38 +463,40 @@ async def _body(request: Request) -> bytes:
         and "expect" in request.headers
     ):
         raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
-    data, seen = b"", 0
+    data = b""
+    size_bytes = 0
     try:
         async with asyncio.timeout(BODY_S):
             async for chunk in request.stream():
-                seen += len(chunk)
-                if seen <= MAX_BODY_BYTES:
+                size_bytes += len(chunk)
+                if size_bytes <= MAX_BODY_BYTES:
                     data += chunk
-                elif seen > MAX_DRAINED_BYTES:
+                elif size_bytes > MAX_DRAINED_BYTES:
                     break
     except TimeoutError:
         raise Refused(
-            408 if seen <= MAX_BODY_BYTES else 413, "the body did not come in time"
+            408 if size_bytes <= MAX_BODY_BYTES else 413, "the body did not come in time"
         ) from None
     except ClientDisconnect:
         raise Refused(400, "the body did not come") from None
-    if seen > MAX_BODY_BYTES:
+    if size_bytes > MAX_BODY_BYTES:
         raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
     return data
 
 
 def _refused(_: Request, error: Exception) -> Response:
-    return _refusal(error.status, error.line) if isinstance(error, Refused) else _refusal(500, "")
+    if isinstance(error, Refused):
+        return _refusal(error.status, error.line)
+    return _refusal(500, "")
 
 
 def _refusal(status: int, line: str) -> JSONResponse:
-    headers = (
-        {"WWW-Authenticate": "Bearer"}
-        if status == 401
-        else {"Connection": "close"}
-        if status in {408, 413}
-        else None
-    )
+    if status == 401:
+        headers = {"WWW-Authenticate": "Bearer"}
+    elif status in {408, 413}:
+        headers = {"Connection": "close"}
+    else:
+        headers = None
     return JSONResponse({"error": line}, status, headers)
 
 
@@ -491,7 +506,8 @@ class Guarded:
     """
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
-        self._app, self._guard = app, guard
+        self._app = app
+        self._guard = guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request, or refuse it."""
@@ -511,7 +527,8 @@ class Guarded:
                 self._guard.check_token(headers, scope.get("subprotocols", ()))
             await self._app(scope, receive, _with_headers(send, host))
         except Refused as refused:
-            answer, send = _refusal(refused.status, refused.line), _with_headers(send, host)
+            answer = _refusal(refused.status, refused.line)
+            send = _with_headers(send, host)
             if scope["type"] == "websocket":
                 await WebSocket(scope, receive, send).send_denial_response(answer)
             else:

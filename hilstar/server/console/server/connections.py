@@ -110,9 +110,9 @@ class ReadingWebSocket(WSProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Bound the bytes that wait in the kernel: a slow peer would get old data."""
         super().connection_made(transport)
-        found = transport.get_extra_info("socket")
-        if found is not None:
-            found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
+        own_socket = transport.get_extra_info("socket")
+        if own_socket is not None:
+            own_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
 
     def handle_connect(self, event: events.Request) -> None:
         """Put itself into the scope, for the application."""
@@ -180,7 +180,8 @@ class OpenPage:
         now_s = time.monotonic()
         hz = self.want.picture_hz
         if hz and now_s - self._picture_s > 0.8 / hz:
-            self._picture_s, self._packed = now_s, packed
+            self._picture_s = now_s
+            self._packed = packed
             self._wake.set()
 
     def close(self, code: int) -> None:
@@ -199,7 +200,8 @@ class OpenPage:
             self._wake.clear()
             while self._texts and self.closing is None:
                 await self._send(self._texts.popleft())
-            packed, self._packed = self._packed, None
+            packed = self._packed
+            self._packed = None
             if packed is not None and self.closing is None:
                 await self._send(packed.truth_with_grid if self.want.grid else packed.truth)
                 await self._send(packed.picture)
@@ -268,9 +270,9 @@ class OpenPages:
         if len(self._clients) < MAX_CLIENTS:
             return
         by_address = Counter(client.address for client in self._clients)
-        worth = {
-            c: (c.line.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients
-        }
+        worth = {}
+        for c in self._clients:
+            worth[c] = (c.line.is_read, c.asked, c.is_page, -by_address[c.address])
         least = min(worth, key=worth.__getitem__)  # the first of equals is the oldest
         self._clients.pop(least)
         least.close(GIVES_WAY)

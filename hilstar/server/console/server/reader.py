@@ -62,13 +62,16 @@ def reasons(
         return [f"the run's process has been silent for {_s(now_ns - seen.host_ns)}"]
     if pace == "session":
         return seen.failed
-    found = [f"the display is lost: {seen.display_lost}"] if seen.display_lost else []
+    if seen.display_lost:
+        reasons_given = [f"the display is lost: {seen.display_lost}"]
+    else:
+        reasons_given = []
     limit_ns = max(HUNG_NS, HUNG_PERIODS / refresh_hz * NS_PER_S)
     if not seen.alive_ns:
-        found.append("the run is being prepared")
+        reasons_given.append("the run is being prepared")
     elif seen.host_ns - seen.alive_ns > limit_ns:
-        found.append(f"the frame loop has hung for {_s(now_ns - seen.alive_ns)}")
-    return [*found, *_of_attitude(seen, now_ns, lately, pace), *_of_rest(seen, lately)]
+        reasons_given.append(f"the frame loop has hung for {_s(now_ns - seen.alive_ns)}")
+    return [*reasons_given, *_of_attitude(seen, now_ns, lately, pace), *_of_rest(seen, lately)]
 
 
 def _of_attitude(
@@ -79,9 +82,10 @@ def _of_attitude(
     if seen.frame.missing:
         yield "no attitude has come yet"
     elif seen.frame.stale:
-        age = (
-            "" if seen.attitude is None else f": {_s(round(seen.attitude.age_ms * NS_PER_MS))} old"
-        )
+        if seen.attitude is None:
+            age = ""
+        else:
+            age = f": {_s(round(seen.attitude.age_ms * NS_PER_MS))} old"
         yield f"the attitude is stale{age}"
     elif pace == "asked" and lately.swap_ns and now_ns - lately.swap_ns > UNASKED_NS:
         yield f"the simulator has asked for no frame for {_s(now_ns - lately.swap_ns)}"
@@ -112,11 +116,9 @@ def _s(time_ns: int) -> str:
     s = time_ns / NS_PER_S
     if s < 60:
         return f"{s:.1f} s"
-    return (
-        f"{int(s // 60)} min {int(s % 60):02d} s"
-        if s < 3600
-        else f"{int(s // 3600)} h {int(s % 3600 // 60):02d} min"
-    )
+    if s < 3600:
+        return f"{int(s // 60)} min {int(s % 60):02d} s"
+    return f"{int(s // 3600)} h {int(s % 3600 // 60):02d} min"
 
 
 class Health:
@@ -130,7 +132,8 @@ class Health:
     def update(self, found: list[str], unix_s: float) -> None:
         """Set the current reasons."""
         if (not found) != self.ok:
-            self.ok, self.since_s = not found, unix_s
+            self.ok = not found
+            self.since_s = unix_s
         self.reasons = found
 
 
@@ -138,7 +141,8 @@ class RunReader:
     """A run for its page. `look` brings it up to date."""
 
     def __init__(self, memory: messages.SharedMemory, setup: messages.Setup) -> None:
-        self._memory, self.setup = memory, setup
+        self._memory = memory
+        self.setup = setup
         self.seen: messages.RunState | None = None
         # an earlier page of this run may have died
         self.health = Health(memory.wrong_since_s or time.time())
@@ -157,12 +161,13 @@ class RunReader:
 
     def look(self) -> list[protocol.EventLine]:
         """Read the shared memory; the new events."""
-        now_ns, unix_s = time.monotonic_ns(), time.time()
-        found = self._memory.states.last()
-        if found is not None:
+        now_ns = time.monotonic_ns()
+        unix_s = time.time()
+        newest_state = self._memory.states.last()
+        if newest_state is not None:
             # cut, being too long: the one before stays
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
-                self.seen = msgspec.json.decode(found[1], type=messages.RunState)
+                self.seen = msgspec.json.decode(newest_state[1], type=messages.RunState)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
@@ -182,14 +187,14 @@ class RunReader:
 
     def new_answer(self) -> TrackerFigures | None:
         """The tracker's figures where it has answered since the last call."""
-        found = None
+        figures = None
         for number, data in self._memory.answers.after(self._answer_at):
             self._answer_at = number
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
                 self.answer = msgspec.json.decode(data, type=messages.NewAnswer)
-                found = self.answer.figures
-                self._answered.append(found)
-        return found
+                figures = self.answer.figures
+                self._answered.append(figures)
+        return figures
 
     def _point(self, now_ns: int) -> protocol.ChartPoint:
         """What the frames since the last look add to the charts."""
@@ -198,7 +203,8 @@ class RunReader:
             self._frame_at = number
             self._add(point, messages.FrameNumbers._make(messages.FRAME.unpack(data)))
         for figures in self._answered:
-            point.wrong, self._wrong = point.wrong + figures.wrong - self._wrong, figures.wrong
+            point.wrong = point.wrong + figures.wrong - self._wrong
+            self._wrong = figures.wrong
             if figures.verdict == "right" and figures.residual_arcsec is not None:
                 point.x_arcsec, point.y_arcsec, point.z_arcsec = figures.residual_arcsec
         self._answered.clear()
@@ -214,7 +220,8 @@ class RunReader:
         return point
 
     def _add(self, point: protocol.ChartPoint, frame: messages.FrameNumbers) -> None:
-        last, self._last = self._last, frame
+        last = self._last
+        self._last = frame
         if frame.flags & messages.HAS_AGE:
             point.take("age_ms", frame.age_ns / NS_PER_MS)
         point.take("frame_ms", (frame.swap_ns - frame.draw_ns) / NS_PER_MS)
@@ -231,7 +238,8 @@ class RunReader:
         if len(self._received) < 2:
             return 0.0
         (_, first), (_, last) = self._received[0], self._received[-1]
-        shown, lost = last.frames - first.frames, last.missed - first.missed
+        shown = last.frames - first.frames
+        lost = last.missed - first.missed
         return lost / (shown + lost) if shown + lost else 0.0
 
     def _pacing_now(self, now_ns: int) -> protocol.Pacing | None:
@@ -257,11 +265,15 @@ class RunReader:
 
     def state(self) -> protocol.PageState:
         """The state of the run, as the page shows it."""
-        seen = messages.RunState(host_ns=0) if self.seen is None else self.seen
-        same: dict[str, Any] = {
-            name: getattr(seen, name) for name in protocol.SkyState.__struct_fields__
-        }
-        now, health = utc_text(time.time()), self.health_now()
+        if self.seen is None:
+            seen = messages.RunState(host_ns=0)
+        else:
+            seen = self.seen
+        same: dict[str, Any] = {}
+        for name in protocol.SkyState.__struct_fields__:
+            same[name] = getattr(seen, name)
+        now = utc_text(time.time())
+        health = self.health_now()
         return protocol.PageState(
             utc=now, health=health, source=self.setup.source, pacing=self.pacing, **same
         )
@@ -281,18 +293,23 @@ class PicturePacker:
     """Packs the newest picture for pages, which takes 10 to 30 ms; called on another thread."""
 
     def __init__(self, memory: messages.SharedMemory, scene: OverlayScene | None) -> None:
-        self._memory, self._scene = memory, scene
+        self._memory = memory
+        self._scene = scene
 
     def newest(
         self, after: int, seen: messages.RunState | None, answer: messages.NewAnswer | None = None
     ) -> PackedPicture | None:
         """The newest picture, None where there is none after that number."""
-        found = self._memory.pictures.last() if self._memory.pictures.newest > after else None
+        if self._memory.pictures.newest > after:
+            found = self._memory.pictures.last()
+        else:
+            found = None
         if found is None or found[0] <= after:
             return None
         number, data = found
         head = messages.PictureHead._make(messages.PICTURE.unpack_from(data))
-        count, dtype = head.width * head.height, np.dtype(f"<u{head.item_bytes}")
+        count = head.width * head.height
+        dtype = np.dtype(f"<u{head.item_bytes}")
         levels = Levels(
             np.frombuffer(data, dtype, count, messages.PICTURE_HEAD_BYTES).reshape(
                 head.height, head.width
@@ -328,7 +345,8 @@ class PicturePacker:
             shown = q if np.isfinite(q).all() else None
             truth = self._scene.marks.truth(head.frame, stars, shown, grid=True)
             if answer is not None and answer.q_lit is not None and shown is not None:
-                residual, lit = answer.figures.residual_arcsec, np.array(answer.q_lit)
+                residual = answer.figures.residual_arcsec
+                lit = np.array(answer.q_lit)
                 marks = self._scene.marks.answer(residual, lit, shown, answer.centroids)
                 truth = msgspec.structs.replace(
                     truth, reported_px=marks.field_px, centroids_px=marks.centroids_px
@@ -353,16 +371,22 @@ def stars_of(
         np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1)
         for axis in ("x_px", "y_px")
     )
-    clipped = set() if seen is None else set(seen.frame.clipped)
+    if seen is None:
+        clipped = set()
+    else:
+        clipped = set(seen.frame.clipped)
     marks = []
     for k in np.argsort(scene.v_mag[stars], kind="stable")[:MAX_STARS].tolist():
-        star, v_mag = int(stars[k]), float(scene.v_mag[stars[k]])
-        hip, label = int(scene.hip[star]), scene.label(star)
-        known_mag = round(v_mag, 2) if math.isfinite(v_mag) else None
-        place, over = (
-            (round(float(x_px[k]), 2), round(float(y_px[k]), 2)),
-            int((hip or label) in clipped),
-        )
+        star = int(stars[k])
+        v_mag = float(scene.v_mag[stars[k]])
+        hip = int(scene.hip[star])
+        label = scene.label(star)
+        if math.isfinite(v_mag):
+            known_mag = round(v_mag, 2)
+        else:
+            known_mag = None
+        place = (round(float(x_px[k]), 2), round(float(y_px[k]), 2))
+        over = int((hip or label) in clipped)
         marks.append(
             protocol.StarMark(*place, known_mag, hip, label, over, scene.colours.get(star, ""))
         )

@@ -107,7 +107,8 @@ class SkySource:
         sample = checked_sample(0, q, None)
         if isinstance(sample, Refusal):
             raise ScpiError(-222, sample.detail)
-        self._q, self.set_ns = sample.q_icrs_to_cam, time.monotonic_ns()
+        self._q = sample.q_icrs_to_cam
+        self.set_ns = time.monotonic_ns()
         self.send(jumps=True)
 
     def rate(self, rate_deg_s: tuple[float, ...]) -> None:
@@ -119,7 +120,8 @@ class SkySource:
         now_ns = time.monotonic_ns()
         if self._q is not None:
             self._q = self._at(self._q, now_ns)
-        self._rate_rad_s, self.set_ns = np.radians(rate_deg_s), now_ns
+        self._rate_rad_s = np.radians(rate_deg_s)
+        self.set_ns = now_ns
         self.send()
 
     def _at(self, q: FloatArray, t_ns: int) -> FloatArray:
@@ -185,8 +187,10 @@ class Peers:
         gives way.
         """
         if len(self.strangers) >= MAX_STRANGERS:
-            ((crowded, _),) = Counter(each.address for each in self.strangers).most_common(1)
-            first = next(each for each in self.strangers if each.address == crowded)
+            ((crowded, _),) = Counter(stranger.address for stranger in self.strangers).most_common(
+                1
+            )
+            first = next(stranger for stranger in self.strangers if stranger.address == crowded)
             self.strangers.pop(first).transport.abort()
         self.strangers[client] = outgoing
 
@@ -219,10 +223,13 @@ class ScpiServer:
     def __init__(
         self, setup: ScpiSetup, reader: RunReader, memory: SharedMemory, give: Give
     ) -> None:
-        self.setup, self.reader, self.give = setup, reader, give
+        self.setup = setup
+        self.reader = reader
+        self.give = give
         self.sky = SkySource(setup.steer_port, setup.max_rate_deg_s) if setup.steer_port else None
         self._memory = memory
-        self.peers, self.turns = Peers(), Turns()
+        self.peers = Peers()
+        self.turns = Turns()
         self._missed = 0
         self._settled = Settled(0, 0)
 
@@ -244,37 +251,38 @@ class ScpiServer:
 
     def conditions(self) -> tuple[int, int]:
         """The conditions of the operation and the questionable status."""
-        seen = self.reader.seen
-        if seen is None:
+        state = self.reader.seen
+        if state is None:
             return 0, NO_ATTITUDE | NOT_WELL
-        operation = SKY_SHOWN * (not seen.frame.blank) | LEDGER_ON * (seen.ledger is not None)
-        operation |= FAULT_ON * bool(seen.faults) | OPERATOR_ON * bool(seen.operator_text)
-        failing = seen.ledger is not None and bool(seen.ledger.failing)
+        operation = SKY_SHOWN * (not state.frame.blank) | LEDGER_ON * (state.ledger is not None)
+        operation |= FAULT_ON * bool(state.faults) | OPERATOR_ON * bool(state.operator_text)
+        failing = state.ledger is not None and bool(state.ledger.failing)
         questionable = (
-            NO_ATTITUDE * (seen.frame.missing or seen.frame.stale) | LEDGER_FAILS * failing
+            NO_ATTITUDE * (state.frame.missing or state.frame.stale) | LEDGER_FAILS * failing
         )
-        questionable |= FRAMES_MISSED * (seen.counts.missed > self._missed)
+        questionable |= FRAMES_MISSED * (state.counts.missed > self._missed)
         return operation, questionable | NOT_WELL * (not self.reader.health.ok)
 
     def pending(self) -> bool:
         """Whether the newest setting of the sky is not shown yet, or not in the run's state; for
         SETTLES_NS at most.
         """
-        sky, seen = self.sky, self.reader.seen
+        sky = self.sky
+        state = self.reader.seen
         now_ns = time.monotonic_ns()
         if sky is None or now_ns - sky.set_ns > SETTLES_NS:
             return False
         if self._settled.set_ns != sky.set_ns:
-            found = self._memory.frames.last()
-            if found is None or seen is None:
+            newest_frame = self._memory.frames.last()
+            if newest_frame is None or state is None:
                 return True
-            frame = FrameNumbers._make(FRAME.unpack(found[1]))
+            frame = FrameNumbers._make(FRAME.unpack(newest_frame[1]))
             # a covered or paused sky is not of now
-            follows = frame.flags & HAS_AGE and not seen.operator.get("pause")
+            follows = frame.flags & HAS_AGE and not state.operator.get("pause")
             if (frame.swap_ns - frame.age_ns if follows else frame.draw_ns) < sky.set_ns:
                 return True
             self._settled = Settled(sky.set_ns, now_ns + MARGIN_NS)
-        return seen is None or seen.host_ns <= self._settled.seen_ns
+        return state is None or state.host_ns <= self._settled.seen_ns
 
     async def settled(self) -> None:
         """Wait until the sky is as it was set. Raises ScpiError (-365) where that takes over
@@ -331,7 +339,8 @@ class Connection:
         self.wrong_tokens = 0
         self.address = address
         self._units_left = 0
-        self._server, self._reader = server, server.reader
+        self._server = server
+        self._reader = server.reader
         self._who = "SCPI" + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
         self._answers: list[str] = []
 
@@ -383,9 +392,12 @@ class Connection:
                 scpi.count(unit, 0)
             self.look()
             query = QUERIES.get(unit.pattern)
-            found = await COMMANDS[unit.pattern](self, unit) if query is None else query(self)
-            if found is not None:
-                self._answers.append(found)
+            if query is None:
+                response = await COMMANDS[unit.pattern](self, unit)
+            else:
+                response = query(self)
+            if response is not None:
+                self._answers.append(response)
         except ScpiError as error:
             self.status.add(error)
 
@@ -405,10 +417,10 @@ class Connection:
         ledger stay.
         """
         self.status.completes = False
-        seen = self._reader.seen
-        for name in () if seen is None else [name for name, on in seen.operator.items() if on]:
+        state = self._reader.seen
+        for name in () if state is None else [name for name, on in state.operator.items() if on]:
             await self._order(Order(id=0, name=name, who=self._who, on=False))
-        for name in [] if seen is None else seen.faults:
+        for name in [] if state is None else state.faults:
             # one of the faults' stream is not this run's to end
             with contextlib.suppress(ScpiError):
                 await self._order(Order(id=0, name="fault", who=self._who, on=False, fault=name))
@@ -448,7 +460,10 @@ class Connection:
     async def switch(self, unit: Unit) -> None:
         """`SKY:BLAN ON` (no light) and `LEDG:STAT ON`: the switches of the page."""
         (on,) = scpi.count(unit, 1)
-        name = "blank" if unit.pattern.startswith("SKY") else "ledger"
+        if unit.pattern.startswith("SKY"):
+            name = "blank"
+        else:
+            name = "ledger"
         await self._order(Order(id=0, name=name, who=self._who, on=scpi.boolean(on)))
 
     async def fault(self, unit: Unit) -> None:
@@ -470,13 +485,15 @@ class Connection:
 
     async def set_attitude(self, unit: Unit) -> None:
         """`SKY:ATT w,x,y,z`: q_icrs_to_cam, from now on."""
-        sky, given = self._steered(), scpi.count(unit, 4)
+        sky = self._steered()
+        given = scpi.count(unit, 4)
         sky.attitude(tuple(map(scpi.number, given)))
 
     async def set_rate(self, unit: Unit) -> None:
         """`SKY:RATE x,y,z`: deg/s about the camera's axes, from now on."""
-        sky, given = self._steered(), scpi.count(unit, 3)
-        sky.rate(tuple(scpi.number(each, "DEG/S") for each in given))
+        sky = self._steered()
+        given = scpi.count(unit, 3)
+        sky.rate(tuple(scpi.number(parameter, "DEG/S") for parameter in given))
 
     async def attitude(self, unit: Unit) -> str:
         """`SKY:ATT?` and `SKY:RATE?`: of the newest frame, once what was set is shown; deg/s."""
@@ -497,10 +514,10 @@ class Connection:
 
     def self_test(self) -> str:
         """`*TST?`: 0 while the run answers and its frame loop moves."""
-        seen = self.seen
+        state = self.seen
         alive = (
-            time.monotonic_ns() - seen.host_ns < ALIVE_NS
-            and seen.host_ns - seen.alive_ns < ALIVE_NS
+            time.monotonic_ns() - state.host_ns < ALIVE_NS
+            and state.host_ns - state.alive_ns < ALIVE_NS
         )
         return str(int(not alive))
 

@@ -109,9 +109,9 @@ def other_sensor(tables: dict[str, Any], name: str) -> tuple[dict[str, Any], lis
         detector["bayer"] = before["bayer"]
     kept = [key for key in (*EFFICIENCIES, *TRACKER_KEYS[1:]) if key in optics]
     for key in DETECTOR_KEYS:
-        for stated in (key, INSTEAD.get(key)):
-            if key not in sensor.detector and stated in before:
-                detector[stated] = before[stated]
-                kept.append(f"{DETECTOR}.{stated}")
+        stated = [other for other in (key, INSTEAD.get(key, key)) if other in before]
+        if key not in sensor.detector and stated:
+            detector[stated[-1]] = before[stated[-1]]
+            kept.append(f"{DETECTOR}.{stated[-1]}")
     changed = {**optics, SENSOR: sensor.name, DETECTOR: detector}
     return {**tables, "tracker": changed}, kept

@@ -3,7 +3,7 @@ stars.
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
@@ -12,6 +12,9 @@ from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
 from hilstar.cli.running import say_optics
 from hilstar.server.console.terminal import print_found, say
+
+if TYPE_CHECKING:
+    from hilstar.server.bench import bench_file as benches
 
 
 def budget(
@@ -38,6 +41,14 @@ def budget(
         ),
     ] = False,
     radec: RadecText = None,
+    sensor: Annotated[
+        str | None,
+        Option(
+            "--sensor",
+            metavar="NAME",
+            help="Whether this sensor (imx250, ...) behind the bench's lens is sensitive enough.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
@@ -49,10 +60,11 @@ def budget(
     from hilstar.tracker.centroiders import FAMILY
 
     check_directory("-o", output)
-    if noise:
+    if noise or sensor is not None:
         if centroider is not None:
-            raise InputError("budget --noise: has every centroider; leave out --centroider")
-        star_noise(bench_file, output, radec, as_json)
+            option = "--sensor" if sensor is not None else "--noise"
+            raise InputError(f"budget {option}: has every centroider; leave out --centroider")
+        star_noise(bench_file, output, radec, sensor, as_json)
         return
     if radec is not None:
         raise InputError(
@@ -77,11 +89,18 @@ def budget(
         say(assumed)
 
 
-def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json: bool) -> None:
-    """The noise of the tracker's own stars."""
+def star_noise(
+    bench_file: Path, output: Path | None, radec: str | None, sensor: str | None, as_json: bool
+) -> None:
+    """The noise of the tracker's own stars, or of those of another sensor behind its lens."""
     import numpy as np
 
-    from hilstar.instruments.simulate.noise import noise_budget, noise_lines, write_noise
+    from hilstar.instruments.simulate.noise import (
+        noise_budget,
+        noise_lines,
+        sensitivity_line,
+        write_noise,
+    )
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.tracker.centroids import CentroidSettings
 
@@ -89,9 +108,27 @@ def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json
         attitude = None
     else:
         attitude = parse_attitude("budget", radec, None)
-    noise = noise_budget(
-        read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0)
-    )
+    file = read_bench_file(bench_file)
+    if sensor is not None:
+        file = with_its_figures(file, sensor)
+    noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
     if output is not None:
         write_noise(make_directory(output), noise)
-    print_found(as_json, noise, noise_lines(noise))
+    answer = [] if sensor is None else [sensitivity_line(noise)]
+    print_found(as_json, noise, [*answer, *noise_lines(noise)])
+
+
+def with_its_figures(file: "benches.BenchFile", name: str) -> "benches.BenchFile":
+    """The bench with another sensor, and a line about where its figures are from."""
+    from hilstar.basics.reading import parse_toml
+    from hilstar.server.bench.bench_file import changed_file
+    from hilstar.server.bench.config.sensor import lacking, other_sensor
+    from hilstar.tracker.sensors import sensor_named
+
+    tables, kept = other_sensor(parse_toml(file.path, file.text), name)
+    changed = changed_file(file, tables)
+    sensor = sensor_named(name, "--sensor")
+    say(f"{sensor.name}: {sensor.source}")
+    if kept:
+        say(f"its sheet has no {lacking(sensor, kept)}: the bench's stand")
+    return changed

@@ -61,7 +61,7 @@ UNIT_RANGES = (
 )
 MIN_STATED_NM = 100.0  # no curve lies below as a whole
 RANGE_NM = (1.0, 100_000.0)  # beyond any sensor; each MAX_INTERVAL_NM costs nodes
-QUANTUM_EFFICIENCIES = ("ccd47-20", "kai-4021")
+QUANTUM_EFFICIENCIES = ("ccd47-20", "kai-4021", "icx285", "imx249", "imx250", "imx252")
 TRANSMISSIONS = ("n-bk7-10mm",)
 BUILT_IN_CURVES = (*QUANTUM_EFFICIENCIES, *TRANSMISSIONS, "johnson-v")
 

@@ -64,6 +64,10 @@ LIMIT_STEP_MAG = 0.25
 TURN_RAD = 1e-6
 NO_PLACE_PX = 1e3  # a star whose light never leaves one pixel, or is all clipped
 MIN_STARS = 2  # for an attitude
+# A pattern of four stars is what lost-in-space solvers look up (tetra3's and astrometry.net's).
+IDENTIFIED = 4
+HALF_FOUND = 0.5
+ENOUGH_SHARE = 0.95  # of fields
 SOURCES = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
 WHO = ("limit", *FAMILY)
 NEA_COLUMNS = [f"{kind}_{way}_arcsec" for kind in WHO for way in ("across", "about")]
@@ -424,7 +428,9 @@ class NoiseBudget:
 
     `rows`, `stars` and `nea` are those of noise.csv, stars.csv and nea.csv, the last of one field
     or medians of several. `nea_arcsec` has its last row by who finds the stars: NEA across and
-    about the boresight in one exposure.
+    about the boresight in one exposure. Half of the stars of `found_v_mag` are found; `found_stars`
+    is how many a field has on average, the median over fields, and `identified_share` is the share
+    of fields that have IDENTIFIED or more.
     """
 
     threshold_sigma: float
@@ -437,6 +443,9 @@ class NoiseBudget:
     nea: list[dict[str, Any]]
     nea_arcsec: dict[str, dict[str, float]]
     channels: dict[str, dict[str, float]]
+    found_v_mag: float
+    found_stars: float
+    identified_share: float
 
 
 def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -> NoisyStar:
@@ -458,6 +467,17 @@ def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -
     )
 
 
+def _check_light(file: BenchFile, stars: Stars) -> None:
+    """Raise InputError where no star gives the tracker light."""
+    if not file.config.tracker.exposure_s:
+        raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
+    if not len(stars):
+        raise InputError(
+            f"[sky] faintest_v_mag = {file.config.sky.faintest_v_mag:g} leaves no star; write a"
+            " larger magnitude"
+        )
+
+
 def noise_budget(
     file: BenchFile,
     q_icrs_to_cam: FloatArray | None,
@@ -474,13 +494,7 @@ def noise_budget(
     tracker = file.config.tracker
     camera = tracker_camera(tracker, file.folder)
     stars = bench_stars(config, file.folder)
-    if not tracker.exposure_s:
-        raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
-    if not len(stars):
-        raise InputError(
-            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger"
-            " magnitude"
-        )
+    _check_light(file, stars)
     background = TrackerBackground(config, file.folder, camera)
     sights = []
     levels_e = []
@@ -523,6 +537,7 @@ def noise_budget(
                 "background_e_per_px": float(sky * middle_e),
             }
     listed = None
+    counts: list[float] = []  # stars that are found in a field, on average
     curves: list[FloatArray] = []  # NEA of each field by who finds its stars: (WHO, 2, n)
     for field in sights:
         star_e = field["electrons_per_s"] * tracker.exposure_s
@@ -540,6 +555,7 @@ def noise_budget(
                 own_noise,
                 {},
             )
+        counts.append(float(bounds[2].sum()))
         turns = turns_of(camera, field["x_px"], field["y_px"])
         others = [
             np.stack([np.interp(-np.log(star_e), -np.log(noise["star_e"][shown]), one)] * 2)
@@ -566,6 +582,9 @@ def noise_budget(
             for kind in WHO
         },
         channels=channels,
+        found_v_mag=float(np.interp(-HALF_FOUND, -noise["detection"], v_mag)),
+        found_stars=float(np.median(counts)),
+        identified_share=float(np.mean(np.array(counts) >= IDENTIFIED)),
     )
 
 
@@ -698,6 +717,17 @@ def _draw(path: Path, found: NoiseBudget) -> None:
         panels[0].set_ylabel("NEA [arcsec]")
         panels[1].set_xscale("log")
         label_ends(panels[1])
+
+
+def sensitivity_line(found: NoiseBudget) -> str:
+    """Whether the tracker is sensitive enough: what it finds, and how often it can identify it."""
+    enough = "sensitive enough" if found.identified_share >= ENOUGH_SHARE else "not enough"
+    field = "the field" if found.fields == 1 else f"a field (median of {found.fields})"
+    fields = f"{IDENTIFIED} or more in {found.identified_share:.0%} of fields"
+    return (
+        f"{enough}: half of the stars of V = {found.found_v_mag:.1f} are found,"
+        f" {found.found_stars:.3g} stars in {field}, {fields}"
+    )
 
 
 def noise_lines(found: NoiseBudget) -> Iterator[str]:

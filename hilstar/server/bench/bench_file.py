@@ -150,6 +150,7 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     kept = {name: value for name, value in msgspec.to_builtins(config).items() if name != "certify"}
     kept["render"] |= _hashed_tolerance(config.render)
     del kept["tracker"]["camera"]  # how images are taken; it changes no frame either
+    del kept["tracker"]["sensor"]  # its figures stand under their own keys
     digest = hashlib.sha256(msgspec.json.encode(kept, order="sorted"))
     tracker = config.tracker
     curves = (*tracker.quantum_efficiencies.values(), tracker.transmission)

@@ -105,7 +105,7 @@ def test_a_missing_option_of_files_that_are_there_is_still_said() -> None:
 
 
 def test_a_wrong_name_of_a_curve_is_offered_those_of_its_kind() -> None:
-    with pytest.raises(InputError, match='write "ccd47-20", "kai-4021", a CSV') as refused:
+    with pytest.raises(InputError, match='write "ccd47-20", "kai-4021", "icx285"') as refused:
         load_curve("cmv4000", "[tracker] quantum_efficiency", built_in=QUANTUM_EFFICIENCIES)
     assert "bk7" not in str(refused.value)
     with pytest.raises(InputError, match='write "n-bk7-10mm", a CSV'):
@@ -115,7 +115,7 @@ def test_a_wrong_name_of_a_curve_is_offered_those_of_its_kind() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("quantum_efficiency", '"n-bk7-10mm"', '"ccd47-20", "kai-4021", a CSV'),
+        ("quantum_efficiency", '"n-bk7-10mm"', '"ccd47-20", "kai-4021", "icx285"'),
         ("transmission", '"ccd47-20"', '"n-bk7-10mm", a CSV'),
     ],
 )

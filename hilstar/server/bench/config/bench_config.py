@@ -25,6 +25,7 @@ from hilstar.server.bench.config.render import (
     MAX_JUDGED_FRAMES,
     RenderSettings,
 )
+from hilstar.server.bench.config.sensor import with_sensor
 from hilstar.server.bench.config.sky import (
     GEOCENTRE,
     SOURCE,
@@ -225,6 +226,7 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
         )
     try:
         _check_finite(tables)
+        tables = with_sensor(tables)
         config = _converted(tables)
         _check_meaning(config)
         _check_sky(config, tables)

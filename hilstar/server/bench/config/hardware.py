@@ -117,9 +117,15 @@ class Tracker(Table, frozen=True):
     focal_length_mm: Positive  #: Focal length of the tracker's lens.
     pixel_pitch_um: PixelPitch  #: Distance between the centres of adjacent pixels.
     resolution_px: Size  #: Size of the detector.
-    #: `"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV
-    #: file with the header `wavelength_nm,value`, or one number for all wavelengths. Default:
-    #: **required**, or the next three
+    #: A sensor by its name, such as `"imx250"` ([which, and what is known of
+    #: them](twin.md#a-sensor-by-its-name)). Its figures stand for `pixel_pitch_um`,
+    #: `resolution_px`, `quantum_efficiency` and those of `[tracker.detector]` that are not written.
+    #: What its sheet lacks has to be written. Default: none
+    sensor: str | None = None
+    #: `"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), `"icx285"`,
+    #: `"imx249"`, `"imx250"` or `"imx252"` (makers' curves, digitised), the path of a CSV file with
+    #: the header `wavelength_nm,value`, or one number for all wavelengths. Default: **required**,
+    #: or the next three
     quantum_efficiency: str | float | None = None
     #: The same of the red channel alone. Default: one channel
     quantum_efficiency_r: str | float | None = None

@@ -16,12 +16,12 @@ import msgspec
 import numpy as np
 import scipy
 
-import hilstar
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.basics.files import make_directory
 from hilstar.basics.reading import CHUNK_BYTES, open_regular
-from hilstar.basics.resources import resource_path
+from hilstar.basics.resources import PACKAGE_DIR, resource_path
+from hilstar.basics.version import __version__
 from hilstar.instruments.campaign.cases import (
     Case,
     CaseMaker,
@@ -72,7 +72,7 @@ class Identity(msgspec.Struct, frozen=True):
 def code_sha256() -> str:
     """The digest of hilstar's code: its Python files and its shaders."""
     digest = hashlib.sha256()
-    package, shaders = Path(hilstar.__file__).parent, resource_path("shaders", "star.vert").parent
+    package, shaders = PACKAGE_DIR, resource_path("shaders", "star.vert").parent
     for root, pattern in ((package, "*.py"), (shaders, "*")):
         for path in sorted(root.rglob(pattern)):
             if path.is_file():
@@ -92,9 +92,7 @@ def difference(found: Identity, wanted: Identity) -> str | None:
 
 def identity_of(gl_renderer: str) -> Identity:
     """The identity of this process with a renderer."""
-    return Identity(
-        hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer
-    )
+    return Identity(__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
 
 
 class Job(msgspec.Struct, frozen=True):

@@ -396,14 +396,15 @@ class Bench:
         drawn &= self.colours is None
         light = linear_light(self.renderer, sprites, self.stars, drawn)
         driven = sprites if self.colours is None else self.colours.driven(sprites, self.stars)
-        truth, star = sprite_truth(self.stars, sprites, self._clipped(driven))
+        seen = self.seen(self.stars, view)
+        truth, star = sprite_truth(seen, sprites, self._clipped(driven))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             found = disc_stars(self.stars, (disc.name for disc in discs))
             middles = (
                 np.array([disc.direction for disc in discs]) @ view.icrs_to_image(self.camera).T
             )
-            rows = truth_table(self.stars, found, *self.camera.project(middles))
+            rows = truth_table(seen, found, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
             truth, star = np.append(truth, rows), np.append(star, found)
         drive: FloatArray | float = 1.0

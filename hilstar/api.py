@@ -351,7 +351,7 @@ class OpenBench(Bench):
         >>> with hilstar.load("bench.toml") as bench:
         ...     budget = bench.budget()
         >>> print(f"{budget.range_mag:.1f} mag")
-        0 mag
+        11.3 mag
         """
         from hilstar.instruments.simulate.budget import budget
         from hilstar.tracker.centroiders import FAMILY
@@ -410,7 +410,7 @@ def assess(
     number of seconds or an Astropy quantity. At `display_attitudes` attitudes the twin measures
     what the display adds. Raises InputError for a fault of either file.
 
-    >>> found = hilstar.assess("run.mcap", display_attitudes=0)
+    >>> found = hilstar.assess("run.mcap", "telemetry.csv", display_attitudes=0)
     """
     from hilstar.instruments.assess.assessment import AssessSettings, assess_files
 

@@ -94,10 +94,9 @@ def file_of_tables(path: Path, tables: Mapping[str, Any] | BenchConfig) -> Bench
     """The bench file that `path` would be with these tables, or with a configuration's; nothing is
     written. Raises InputError as `read_bench_file` does.
     """
-    if not isinstance(tables, Mapping):
-        tables = msgspec.to_builtins(tables)
+    given = tables if isinstance(tables, Mapping) else msgspec.to_builtins(tables)
     try:
-        return bench_file_of(path, toml_text(tables))
+        return bench_file_of(path, toml_text(given))
     except TypeError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -1,5 +1,11 @@
 """hilstar: the stars that a star tracker would see, on a monitor, with the flux that it would
 collect.
+
+>>> import hilstar
+>>> with hilstar.load("bench.toml") as bench:
+...     frame = bench.frame([0.6987226, 0.7135120, -0.0370377, 0.0362700])
+>>> print(len(frame.truth), "stars")
+218 stars
 """
 
 from typing import TYPE_CHECKING, Any
@@ -7,10 +13,13 @@ from typing import TYPE_CHECKING, Any
 from hilstar.basics.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from hilstar import rotation, testing
+    from hilstar.api import OpenBench as Bench
+    from hilstar.api import SkyFrame as Frame
+    from hilstar.api import assess, load
     from hilstar.basics.errors import HilstarError, InputError, MachineError
-    from hilstar.server.bench.build import load
+    from hilstar.instruments.compare import compare
     from hilstar.server.bench.drawn import Drawn
-    from hilstar.server.bench.frame import Bench, Frame
     from hilstar.server.sender import Sender
 
 __all__ = [
@@ -21,8 +30,16 @@ __all__ = [
     "InputError",
     "MachineError",
     "Sender",
+    "assess",
+    "compare",
     "load",
+    "rotation",
+    "testing",
 ]
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -31,6 +48,10 @@ def __getattr__(name: str) -> Any:
     """
     if name not in __all__:
         raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
+    from importlib import import_module
+
+    if name in {"rotation", "testing"}:
+        return import_module(f"hilstar.{name}")
     from hilstar.basics import errors
 
     if hasattr(errors, name):
@@ -39,6 +60,10 @@ def __getattr__(name: str) -> Any:
         from hilstar.server.sender import Sender
 
         return Sender
-    from hilstar.server.bench import build, frame
+    if name == "compare":
+        from hilstar.instruments.compare import compare
 
-    return getattr(build if name == "load" else frame, name)
+        return compare
+    from hilstar import api
+
+    return getattr(api, {"Bench": "OpenBench", "Frame": "SkyFrame"}.get(name, name))

@@ -1,5 +1,8 @@
 """For your own scripts: unit quaternions, Hamilton, scalar first, and what they do to
 directions.
+
+>>> hilstar.rotation.from_radec_roll_deg(84.057, -1.2, 0.0).round(7).tolist()
+[0.6987226, 0.713512, -0.0370377, 0.03627]
 """
 
 from hilstar.basics.rotation import (

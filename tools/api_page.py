@@ -17,8 +17,10 @@ LINE_CHARACTERS = 100
 SECTIONS: dict[str, dict[str, tuple[str, ...]]] = {
     "Benches and frames": {
         "hilstar.load": (),
-        "hilstar.Bench": ("frame", "losses_mag", "close"),
-        "hilstar.Frame": (),
+        "hilstar.Bench": ("frame", "draw", "simulate", "verify", "budget", "losses_mag", "close"),
+        "hilstar.Frame": ("to_table", "wcs", "save"),
+        "hilstar.Drawn": (),
+        "hilstar.assess": (),
     },
     "Comparison of two skies": {
         "hilstar.testing.assert_same_sky": (),
@@ -46,7 +48,8 @@ SECTIONS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "Errors": {"hilstar.HilstarError": (), "hilstar.InputError": (), "hilstar.MachineError": ()},
 }
-FROM_LOAD = {"hilstar.Bench"}  # made by a function: how it is put together is nobody's call
+# made by others: how they are put together is nobody's call
+FROM_LOAD = {"hilstar.Bench", "hilstar.Frame", "hilstar.Drawn"}
 
 
 def page() -> str:
@@ -74,7 +77,15 @@ def _entry(level: str, name: str, found: Any, code: str) -> Iterator[str]:
     yield f"{level} {name}\n"
     if code:
         yield f"```text\n{code}\n```\n"
-    yield f"{inspect.getdoc(found)}\n"
+    yield f"{_with_fences(inspect.getdoc(found) or '')}\n"
+
+
+def _with_fences(text: str) -> str:
+    """A docstring whose examples, each from its first prompt to a blank line, stand in fences."""
+    paragraphs = text.split("\n\n")
+    return "\n\n".join(
+        f"```text\n{part}\n```" if part.startswith(">>> ") else part for part in paragraphs
+    )
 
 
 def signature(name: str, found: Any) -> str:
@@ -89,11 +100,9 @@ def signature(name: str, found: Any) -> str:
         return ""
     shown = inspect.signature(found)
     returns = "" if inspect.isclass(found) else f" -> {shown.return_annotation}"
-    parameters = [_parameter(each) for each in shown.parameters.values() if each.name != "self"]
-    first = next(
-        (k for k, each in enumerate(shown.parameters.values()) if each.kind is each.KEYWORD_ONLY),
-        None,
-    )
+    given = [each for each in shown.parameters.values() if each.name != "self"]
+    parameters = [_parameter(each) for each in given]
+    first = next((k for k, each in enumerate(given) if each.kind is each.KEYWORD_ONLY), None)
     if first is not None:
         parameters.insert(first, "*")
     line = f"{short}({', '.join(parameters)}){returns}"

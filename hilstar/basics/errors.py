@@ -12,6 +12,12 @@ CUT = "[...]"
 class HilstarError(Exception):
     """One line for a person: what is wrong, where, and what to write instead; of bounded length,
     whatever it quotes.
+
+    >>> try:
+    ...     hilstar.load("nowhere.toml")
+    ... except hilstar.HilstarError as error:
+    ...     print(error)
+    nowhere.toml: cannot be read (No such file or directory); give the path of a bench file
     """
 
     exit_code = 1
@@ -21,13 +27,22 @@ class HilstarError(Exception):
 
 
 class InputError(HilstarError):
-    """The command or a file was wrong."""
+    """The command, a call or a file was wrong.
+
+    >>> hilstar.load(5)
+    Traceback (most recent call last):
+    hilstar.basics.errors.InputError: load 5: give the path of a bench file, ...
+    """
 
     exit_code = 2
 
 
 class MachineError(HilstarError):
-    """The machine lacks something; the line says what to install."""
+    """The machine lacks something; the line says what to install.
+
+    >>> issubclass(hilstar.MachineError, hilstar.HilstarError)
+    True
+    """
 
     exit_code = 3
 

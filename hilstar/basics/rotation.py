@@ -6,6 +6,8 @@ Arrays may carry leading axes: a quaternion is the last axis.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -131,6 +133,22 @@ def direction_of(ra_deg: ArrayLike, dec_deg: ArrayLike) -> FloatArray:
     ra = np.radians(ra_deg)
     dec = np.radians(dec_deg)
     return np.stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)), axis=-1)
+
+
+class Places(NamedTuple):
+    """Right ascensions [0, 360) and declinations (...), degrees."""
+
+    ra_deg: FloatArray
+    dec_deg: FloatArray
+
+
+def to_radec_deg(directions: FloatArray) -> Places:
+    """The places of directions (..., 3), of any length, in the axes that these have; the inverse of
+    `direction_of`.
+    """
+    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+    ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
+    return Places(ra_deg, np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
 def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:

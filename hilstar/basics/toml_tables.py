@@ -7,6 +7,8 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import date, time
+from pathlib import PurePath
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
@@ -123,27 +125,57 @@ def toml_text(tables: Mapping[str, Any]) -> str:
     """A file of plain keys, then a table for each dictionary; None and empty tables are left
     unsaid.
 
-    TOML writes numbers, truth values, plain text and lists as JSON does; a list of lists stands row
-    by row.
+    A list of lists stands row by row. Arrays and numbers of NumPy, and paths, are written as what
+    they hold. Raises TypeError for a value that TOML does not have.
     """
-    plain_keys = {key: value for key, value in tables.items() if not isinstance(value, dict)}
+    plain_keys = {key: value for key, value in tables.items() if not isinstance(value, Mapping)}
     parts = {"": plain_keys} | {
-        f"[{key}]\n": value for key, value in tables.items() if isinstance(value, dict)
+        f"[{_key(name)}]\n": value for name, value in tables.items() if isinstance(value, Mapping)
     }
     texts = []
     for head, part in parts.items():
         rows = "".join(
-            f"{key} = {_written(value)}\n" for key, value in part.items() if value is not None
+            f"{_key(key)} = {_rows(value)}\n" for key, value in part.items() if value is not None
         )
         texts += [head + rows] if rows else []
     return "\n".join(texts)
 
 
-def _written(value: Any) -> str:
+def _key(key: object) -> str:
+    plain_key = re.fullmatch(r"[A-Za-z0-9_-]+", str(key))
+    return str(key) if plain_key else json.dumps(str(key))
+
+
+def _rows(value: Any) -> str:
     if isinstance(value, list) and value and isinstance(value[0], list):
-        rows = ",\n    ".join(map(json.dumps, value))
+        rows = ",\n    ".join(map(_written, value))
         return f"[\n    {rows},\n]"
-    return json.dumps(value)
+    return _written(value)
+
+
+def _written(value: Any) -> str:
+    """A value as TOML writes it. A quantity is none: its key names the unit."""
+    if hasattr(value, "tolist") and not hasattr(value, "unit"):
+        value = value.tolist()
+    match value:
+        case bool() | str():
+            return json.dumps(value)
+        case int() | float():
+            return repr(value)
+        case PurePath():
+            return json.dumps(str(value))
+        case date() | time():
+            return value.isoformat()
+        case list() | tuple():
+            return f"[{', '.join(map(_written, value))}]"
+        case Mapping():
+            given = {key: item for key, item in value.items() if item is not None}
+            pairs = (f"{_key(key)} = {_written(item)}" for key, item in given.items())
+            return f"{{ {', '.join(pairs)} }}"
+    raise TypeError(
+        f"{shortened(repr(value))}: write text, a number, true or false, or a list of them, in the"
+        " unit that its key names"
+    )
 
 
 def _toml(value: Any) -> str:

@@ -7,8 +7,9 @@ from __future__ import annotations  # docs/python-api.md shows annotations as th
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LinkCounts
@@ -30,10 +31,13 @@ from hilstar.attitude.wire.protocol import MAX_SENDER
 from hilstar.attitude.wire.serial_link import SerialLink, serial_target
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqSender
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.attitudes import quaternion_of, rate_of, t_ns_of
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import caught
+
+if TYPE_CHECKING:
+    from hilstar.basics.attitudes import Angle, Attitude, Rate, Time
 
 LISTEN_MS = 20
 PATIENCE_S = 0.5  # a line that accepts nothing for this long has no reader
@@ -41,7 +45,6 @@ MAX_TAKEN = 100
 PROBE_S = 0.02
 UDP = re.compile(r"udp://(?:\[([0-9A-Fa-f:.]+(?:%\w+)?)\]|([^:\[\]/\s]+)):(\d{1,5})")
 Clock = Callable[[], int]
-Numbers = Sequence[float] | FloatArray
 
 
 def open_sender(
@@ -198,6 +201,9 @@ class Sender(Closing):
     answers hilstar's time requests on it, and keeps the newest `status`. `sender` is this sender's
     number, 1 to 254, by which hilstar tells it from another; 0: not given. Raises InputError where
     the road cannot be opened.
+
+    >>> with hilstar.Sender("udp://127.0.0.1:5560") as sender:
+    ...     sender.send([0.6987226, 0.7135120, -0.0370377, 0.0362700], [0, 0, 0.01])
     """
 
     def __init__(
@@ -247,27 +253,25 @@ class Sender(Closing):
 
     def send(
         self,
-        q_icrs_to_cam: Numbers,
-        rate_cam_rad_s: Numbers | None = None,
+        q_icrs_to_cam: Attitude,
+        rate_cam_rad_s: Rate | None = None,
         *,
-        t_ns: int | None = None,
+        t_ns: Time | None = None,
         discontinuity: bool = False,
+        roll_deg: Angle | None = None,
     ) -> None:
         """Send one attitude: a unit quaternion (4,), scalar first, and its rate (3,), rad/s, camera
         components, if it is known.
 
-        `t_ns` is the instant of the attitude on the simulation's clock, by default now.
+        A SciPy Rotation or an Astropy SkyCoord with `roll_deg` is sent as q_icrs_to_cam, and
+        quantities in their units. `t_ns` is the instant of the attitude on the simulation's clock,
+        by default now.
         `discontinuity` says that the attitude jumped. Raises InputError for what hilstar would
         refuse. Only a full serial line is waited for, half a second at most.
         """
-        at_ns = self._clock() if t_ns is None else int(t_ns)
-        q = tuple(map(float, q_icrs_to_cam))
-        rate = None if rate_cam_rad_s is None else tuple(map(float, rate_cam_rad_s))
-        if len(q) != 4 or (rate is not None and len(rate) != 3):
-            raise InputError(
-                f"{len(q)} and {len(rate or ())} numbers; give a quaternion of 4 (w, x, y, z) and a"
-                " rate of 3"
-            )
+        at_ns = self._clock() if t_ns is None else t_ns_of(t_ns)
+        q = tuple(quaternion_of(q_icrs_to_cam, roll_deg).tolist())
+        rate = None if rate_cam_rad_s is None else tuple(rate_of(rate_cam_rad_s).tolist())
         sample = checked_sample(at_ns, q, rate, self._sequence, discontinuity, self._number)
         if isinstance(sample, Refusal):
             raise InputError(f"{sample.detail} ({sample.reason})")

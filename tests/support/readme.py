@@ -17,8 +17,11 @@ def blocks(language: str) -> list[str]:
 
 
 def plain_pytest(folder: Path) -> dict[str, str]:
-    """The environment of a reader whose pytest has no plugins of others, and no configuration
-    above the folder.
+    """The environment of a reader whose pytest has hilstar's plugin and no others', and no
+    configuration above the folder, whose own stays.
     """
-    (folder / "pytest.ini").write_text("[pytest]\n")
-    return os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    configuration = folder / "pytest.ini"
+    if not configuration.exists():
+        configuration.write_text("[pytest]\n")
+    plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "hilstar.pytest_plugin"}
+    return os.environ | plugins

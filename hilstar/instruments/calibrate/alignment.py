@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-import hilstar
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import (
@@ -29,6 +28,7 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.version import __version__
 from hilstar.display.geometry import (
     ErrorTable,
     MadeTable,
@@ -347,7 +347,7 @@ def write_alignment(
         lens_of = f"{Path(name).name}, {notes.made.when or 'no date'}"
     axes = ("rotation_x_arcsec", "rotation_y_arcsec", "rotation_z_arcsec")
     made = MadeTable(
-        by=f"hilstar {hilstar.__version__}",
+        by=f"hilstar {__version__}",
         when=datetime.datetime.now(datetime.UTC).date().isoformat(),
         poses=notes.made.poses,
         pairs=len(found.pairs),

@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-import hilstar
 from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
+from hilstar.basics.version import __version__
 from hilstar.display.calibration import BUILT_IN
 from hilstar.display.identity import MonitorIdentity, sha256_of
 from hilstar.instruments.certify.assembly import Assembled, assemble, read_bench
@@ -131,7 +131,7 @@ def certify(
         valid_until=(
             now.astimezone(datetime.UTC).date() + datetime.timedelta(days=settings.valid_days)
         ).isoformat(),
-        hilstar=hilstar.__version__,
+        hilstar=__version__,
         bench=file.path.name,
         bench_sha256=file.sha256,
         files=files,

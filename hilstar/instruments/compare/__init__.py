@@ -49,6 +49,10 @@ def assert_same_sky(
 
     Raises AssertionError with the common difference of all stars and a line for each star that
     differs otherwise (at most 20). Raises InputError as `compare` does.
+
+    >>> with hilstar.load("bench.toml") as bench:
+    ...     frame = bench.frame([0.6987226, 0.7135120, -0.0370377, 0.0362700])
+    ...     comparison = hilstar.testing.assert_same_sky(frame, frame)
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
     if not comparison.same:
@@ -75,6 +79,11 @@ def compare(
     Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else
     by the Frames' own. Raises InputError for limits that are not above 0, images of different size
     or without a star, and files of another kind.
+
+    >>> with hilstar.load("bench.toml") as bench:
+    ...     frame = bench.frame([0.6987226, 0.7135120, -0.0370377, 0.0362700])
+    >>> hilstar.compare(frame, frame).same
+    True
     """
     images = _image(frame), _image(golden)
     same = images[0].ndim == images[1].ndim

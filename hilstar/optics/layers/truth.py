@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray, IntArray, with_columns
-from hilstar.basics.rotation import to_matrix
+from hilstar.basics.rotation import to_matrix, to_radec_deg
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.bodies import disc_stars
 from hilstar.optics.sprites import FrameLight
@@ -38,6 +38,8 @@ TRUTH_DTYPE = np.dtype(
         ("name", "U32"),
         ("sigma_pos_mas", "f8"),
         ("sigma_mag", "f8"),
+        ("ra_deg", "f8"),
+        ("dec_deg", "f8"),
     ]
 )
 
@@ -55,6 +57,9 @@ def truth_table(
 ) -> npt.NDArray[np.void]:
     """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none
     clipped yet.
+
+    `ra_deg` and `dec_deg` are where `stars` have them, ICRS axes: with aberration and the air, as
+    they are drawn.
     """
     truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
     truth["hip"], truth["name"] = stars.hip[star], stars.names(star)
@@ -64,6 +69,7 @@ def truth_table(
     truth["electrons_per_s"] = stars.electrons_per_s[star]
     truth["drawn"] = True
     truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
+    truth["ra_deg"], truth["dec_deg"] = to_radec_deg(stars.directions(star))
     listed = stars.row[star] >= 0
     row = stars.row[star[listed]]
     catalog = stars.catalog
@@ -191,6 +197,8 @@ def added_truth(sprites: FrameLight, over: npt.NDArray[np.bool_]) -> npt.NDArray
         "separation_arcsec",
         "sigma_pos_mas",
         "sigma_mag",
+        "ra_deg",
+        "dec_deg",
     ):
         rows[name] = np.nan
     rows["drawn"] = True
@@ -237,9 +245,7 @@ def brightest_in_view(
     x_px = x_px[brightest]
     y_px = y_px[brightest]
     off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
-    x, y, z = vectors.T
-    ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
-    dec_deg = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    ra_deg, dec_deg = to_radec_deg(vectors)
     constellations: list[str] = []
     if len(star_rows):
         # takes half a second, which only this needs

@@ -15,7 +15,7 @@ own.
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from hilstar.attitude.wire.source import HILSTARS, Mounting
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import place_of
 from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
+from hilstar.basics.toml_tables import toml_text
 from hilstar.display.calibration import BUILT_IN
 from hilstar.server.bench.config import (
     GAUSSIAN,
@@ -87,6 +88,17 @@ def bench_file_of(path: Path, text: str) -> BenchFile:
     """
     config = parse_config(path, text)
     return BenchFile(path, text, today(config), _sha256(config, path.parent))
+
+
+def file_of_tables(path: Path, tables: Mapping[str, Any] | BenchConfig) -> BenchFile:
+    """The bench file that `path` would be with these tables, or with a configuration's; nothing is
+    written. Raises InputError as `read_bench_file` does.
+    """
+    given = tables if isinstance(tables, Mapping) else msgspec.to_builtins(tables)
+    try:
+        return bench_file_of(path, toml_text(given))
+    except TypeError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def changed_file(file: BenchFile, tables: dict[str, Any]) -> BenchFile:

@@ -373,14 +373,15 @@ class Bench:
             driven = sprites
         else:
             driven = self.colours.driven(sprites, self.stars)
-        truth, star = sprite_truth(self.stars, sprites, self._clipped(driven))
+        apparent = self.seen(self.stars, view)
+        truth, star = sprite_truth(apparent, sprites, self._clipped(driven))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             disc_rows = disc_stars(self.stars, (disc.name for disc in discs))
             middles = (
                 np.array([disc.direction for disc in discs]) @ view.icrs_to_image(self.camera).T
             )
-            rows = truth_table(self.stars, disc_rows, *self.camera.project(middles))
+            rows = truth_table(apparent, disc_rows, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
             truth = np.append(truth, rows)
             star = np.append(star, disc_rows)

@@ -317,6 +317,12 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
+    """A preview for the eye as a file (see `preview_png`)."""
+    preview = preview_png(codes)
+    written(path, lambda file: file.write(preview))
+
+
+def preview_png(codes: Codes) -> bytes:
     """A preview for the eye: each star a disc that grows with its code, as on a star chart; a body
     has its own size.
 
@@ -327,7 +333,7 @@ def write_preview_png(path: Path, codes: Codes) -> None:
     codes = codes if codes.ndim == 2 else codes.max(axis=2)
     signal = codes.astype(np.float32) / np.float32(max(int(codes.max()), 1))
     smooth = gaussian_filter(_discs(signal) ** PREVIEW_POWER, PREVIEW_BLUR_PX)
-    written(path, lambda file: file.write(png_of((255 * np.clip(smooth, 0, 1)).astype(np.uint8))))
+    return png_of((255 * np.clip(smooth, 0, 1)).astype(np.uint8))
 
 
 def _bodies(signal: Float32Array) -> BoolArray:

@@ -88,6 +88,8 @@ def test_the_frame_s_files_agree_with_each_other(orion):
         "name",
         "sigma_pos_mas",
         "sigma_mag",
+        "ra_deg",
+        "dec_deg",
     ]
     assert list(rows[0]) == [*first, *last]
     with fits.open(folder / "o.fits") as hdus:

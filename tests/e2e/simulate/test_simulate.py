@@ -60,6 +60,8 @@ def test_the_fits_has_dn_header_and_truth(tmp_path):
         "name",
         "sigma_pos_mas",
         "sigma_mag",
+        "ra_deg",
+        "dec_deg",
     ]
     optics = ["x_centroid_px", "y_centroid_px", "relative_illumination"]
     assert list(truth.names) == [*first, *last, *optics]

@@ -112,8 +112,8 @@ def test_with_keys_it_is_let_in_on_either_side_of_the_connection(tmp_path, conne
 @pytest.mark.parametrize(
     ("q", "rate", "said"),
     [
-        ((1, 0, 0), None, "4"),
-        (ORION, (0, 0), "a rate of 3"),
+        ((1, 0, 0), None, "3 numbers"),
+        (ORION, (0, 0), "three numbers"),
         ((1, 1, 0, 0), None, "norm"),
         ((float("nan"), 0, 0, 1), None, "nan"),
         (ORION, (0, 0, 1e9), "rad/s"),

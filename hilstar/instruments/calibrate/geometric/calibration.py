@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import hilstar
 from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.charts import BLUE, SMALL_PT, chart
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.version import __version__
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.geometric import fit as fits
@@ -488,9 +488,7 @@ def write_calibrated(
     )
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()
-    made = MadeTable(
-        by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses)
-    )
+    made = MadeTable(by=f"hilstar {__version__}", when=when, poses=len(found.problem.q_poses))
     write_geometry(
         path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made, identity)
     )

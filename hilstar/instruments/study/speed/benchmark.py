@@ -56,7 +56,7 @@ FRESH = """
 import re, sys, time
 from pathlib import Path
 begin = time.perf_counter()
-from hilstar import load
+from hilstar.server.bench.build import load
 imported = time.perf_counter()
 import numpy as np
 with load(sys.argv[1]) as bench:

@@ -1,0 +1,92 @@
+"""The pytest plugin, in a pytest of its own: what passes, what fails with which line, and what is
+written.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.benches import bench_text
+
+TEST = """
+from hilstar.rotation import from_radec_roll_deg
+
+
+def test_belt(hilstar_bench, assert_same_sky):
+    assert_same_sky(hilstar_bench.frame(from_radec_roll_deg(84.057, {dec_deg}, 0.0)))
+
+
+def test_named(hilstar_bench, assert_same_sky):
+    assert_same_sky(hilstar_bench.frame(from_radec_roll_deg(10.0, 20.0, 0.0)), "andromeda")
+"""
+SHIFT_DEG = 0.01  # 0.3 px of this bench, 300 times the limit
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    (tmp_path / "bench.toml").write_text(bench_text())
+    write_test(tmp_path, -1.2)
+    return tmp_path
+
+
+def write_test(folder: Path, dec_deg: float) -> None:
+    (folder / "test_sky.py").write_text(TEST.format(dec_deg=dec_deg))
+
+
+def pytest_in(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    plugins = ("-p", "hilstar.pytest_plugin", "-p", "no:cacheprovider", "-p", "no:xdist")
+    command = [sys.executable, "-B", "-m", "pytest", "-q", *plugins, *options]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.e2e
+def test_golden_frames_are_written_compared_and_updated_where_they_differ(project):
+    missing = pytest_in(project)
+    assert missing.returncode == 1
+    assert "test_belt.fits: there is no golden frame; write it with" in missing.stdout
+    assert not (project / "golden").exists()
+
+    written = pytest_in(project, "--update-golden")
+    assert written.returncode == 0, written.stdout
+    golden = project / "golden"
+    names = {path.name for path in golden.iterdir()}
+    assert names == {"test_belt.fits", "test_belt.csv", "andromeda.fits", "andromeda.csv"}
+    assert written.stdout.count("wrote ") == 2
+    assert pytest_in(project).returncode == 0
+
+    write_test(project, -1.2 + SHIFT_DEG)
+    before = (golden / "andromeda.fits").stat().st_mtime_ns
+    moved = pytest_in(project)
+    assert moved.returncode == 1
+    assert "test_belt" in moved.stdout and "1 passed" in moved.stdout
+    updated = pytest_in(project, "--update-golden")
+    assert updated.returncode == 0
+    assert updated.stdout.count("wrote ") == 1
+    assert (golden / "andromeda.fits").stat().st_mtime_ns == before
+    assert pytest_in(project).returncode == 0
+
+
+@pytest.mark.e2e
+def test_a_missing_bench_is_one_line(project):
+    (project / "pytest.ini").write_text("[pytest]\nhilstar_bench = nowhere.toml\n")
+    failed = pytest_in(project)
+    assert failed.returncode == 1
+    assert "nowhere.toml: cannot be read" in failed.stdout
+    assert "Traceback" not in failed.stdout
+
+
+def test_the_plugin_imports_nothing_of_hilstar_but_its_version():
+    """A pytest of any project in the environment pays for the import."""
+    code = "import sys, hilstar.pytest_plugin; print(*sorted(m for m in sys.modules if 'hil' in m))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) <= {
+        "hilstar",
+        "hilstar.basics",
+        "hilstar.basics.version",
+        "hilstar.pytest_plugin",
+    }

@@ -12,11 +12,6 @@ from typing import TYPE_CHECKING, overload
 
 if TYPE_CHECKING:
     from hilstar.basics.arrays import FloatArray
-from hilstar.basics.arrays import FloatArray
-
-KM_PER_AU = 149_597_870.7
-
-COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 
 NS_PER_US = 1_000
 NS_PER_MS = 1_000_000
@@ -27,6 +22,7 @@ MAD_TO_SIGMA = 1.482602218505602
 ERROR_OF_MEDIAN = math.sqrt(math.pi / 2)  # in those of the mean, for normal errors
 LIGHT_M_S = 299_792_458.0  # SI, exact
 LIGHT_KM_S = LIGHT_M_S / 1000.0
+KM_PER_AU = 149_597_870.7  # IAU 2012 Resolution B2, exact
 MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
 MAG_PER_RELATIVE = 2.5 / math.log(10)  # a small relative error of a flux, in magnitudes
 
@@ -118,6 +114,7 @@ ASCII_OF = {
 # OpenGL versions to ask for, newest first: NVIDIA's driver gives the version that is asked for, and
 # no newer one.
 GL_VERSIONS = ((4, 6), (4, 5), (4, 3), (3, 3))
+COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 
 
 @overload

@@ -25,7 +25,8 @@ from hilstar.server.bench.bench_file import BenchFile, file_of_tables, read_benc
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import FieldsOfView, fields_of_view
 from hilstar.server.bench.config import BenchConfig
-from hilstar.server.bench.frame import Bench, Drawn, Frame, checked_quaternion
+from hilstar.server.bench.drawn import Drawn
+from hilstar.server.bench.frame import Bench, Frame, checked_quaternion
 from hilstar.server.bench.frame_files import (
     preview_png,
     sky_header,

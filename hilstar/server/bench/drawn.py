@@ -15,6 +15,11 @@ from hilstar.optics.sprites import (
 class Drawn:
     """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by
     HIP number or a body's name.
+
+    >>> with hilstar.load("bench.toml") as bench:
+    ...     drawn = bench.draw([0.6987226, 0.7135120, -0.0370377, 0.0362700])
+    >>> drawn.levels.shape, drawn.clipped_hip
+    ((1080, 1920), ())
     """
 
     def __init__(

@@ -13,7 +13,7 @@ leading bits are an index.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -64,6 +64,13 @@ class Panel:
                 "the uniformity map has pixels that are not positive; give each pixel its light"
                 " relative to the mean"
             )
+
+    def in_part(self, part: tuple[slice, slice]) -> "Panel":
+        """The panel of a part of the image, whose pixels are the part's."""
+        if self.uniformity is None:
+            return self
+        primaries = tuple(one.in_part(part) for one in self.primaries)
+        return replace(self, uniformity=self.uniformity[part], primaries=primaries)
 
     def gain(self) -> Float32Array | None:
         """The factor of the wanted light before it is quantised, float32 (height, width), or None

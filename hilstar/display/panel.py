@@ -1,6 +1,6 @@
 """A monitor as light becomes levels on it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,13 @@ class Panel:
                 "the uniformity map has pixels that are not positive; give each pixel its light"
                 " relative to the mean"
             )
+
+    def in_part(self, part: tuple[slice, slice]) -> "Panel":
+        """The panel of a part of the image, whose pixels are the part's."""
+        if self.uniformity is None:
+            return self
+        primaries = tuple(primary.in_part(part) for primary in self.primaries)
+        return replace(self, uniformity=self.uniformity[part], primaries=primaries)
 
     def gain(self) -> Float32Array | None:
         """The factor of the wanted light before it is quantised, float32 (height, width), or None

@@ -35,6 +35,8 @@ SMALL_NUMBERS = {
     39: "a pixel of 2.7 tracker pixels, on its side and mirrored, of which 3 % is seen",
     41: "a black level in read noise of 0.12 DN",
 }
+# An ADC hides a part of its glow, which the response's error says: the twin judges it no closer.
+ROUNDED_BLACK = 41
 MEASURED = {"focus", "geometry", "uniformity", "photometry", "scale"}
 
 
@@ -77,3 +79,5 @@ def test_each_figure_of_a_small_bench_is_within_its_error(tmp_path, number):
     assert compared.keys() >= MEASURED
     off = {name: one.sigmas for name, one in compared.items() if one.sigmas is not None}
     assert all(abs(sigmas) < MAX_SIGMAS for sigmas in off.values()), off
+    if number == ROUNDED_BLACK:
+        assert steps["verify"]["verdict"] == "done", steps["verify"]["line"]

@@ -76,7 +76,7 @@ STILL_S = 0.5  # a file that has not grown for so long is complete
 SWAP_JITTER_NS = 20_000
 MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 # of their images together: eight of a whole detector of 4096 x 4096 pixels would take 0.5 GB
-MASKS_KEPT_BYTES = 128_000_000
+MASKS_KEPT_BYTES = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_matrix, to_matrix
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
-from hilstar.display.quantise import shown_light
+from hilstar.display.quantise import Panel, shown_light
 from hilstar.display.response import Levels
 from hilstar.instruments.calibrate.first_light.context import MAX_FILL, StepContext
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern
@@ -507,7 +507,6 @@ def _codes_mag(
     """How much fainter the codes are than the light asked for (n,), magnitudes, within the
     tracker's window.
     """
-    shown = np.mean([shown_light(frame_levels, bench.panel) for frame_levels in levels], axis=0)
     geometry = context.geometry()
     reach = math.ceil(
         (spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
@@ -516,9 +515,16 @@ def _codes_mag(
     for x, y in np.rint(screen_px).astype(np.intp):
         part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
         wanted = float(frame.linear[part].sum(dtype=np.float64))
-        off.append(magnitude(float(shown[part].sum()) / wanted) if wanted > 0 else 0.0)
+        # In the window alone: light of a whole 8K screen is 0.3 GB, and here were three of them.
+        shown = np.mean([_light_in(each, bench.panel, part) for each in levels])
+        off.append(magnitude(float(shown) / wanted) if wanted > 0 else 0.0)
     # such a star is not shown, and will not be found
     return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))
+
+
+def _light_in(levels: Levels, panel: Panel, part: tuple[slice, slice]) -> float:
+    """The light of a part of an image's levels, electrons per second."""
+    return float(shown_light(Levels(levels[part]), panel.in_part(part)).sum())
 
 
 def _compared(

@@ -49,6 +49,7 @@ MAX_FRAMES = 25  # of a field that are taken without being asked for
 MAX_ASKED_FRAMES = 1000  # of a field: the most that first-light --frames takes
 GRID = 21  # places along each side of the screen at which a truth is compared
 READINGS_FILE = "readings.csv"  # stars and their DN, as `calibrate scale --reading` takes them
+BLACK_LEVEL, BLACK_ERROR = "photometry.black_level", "photometry.black_level_error"
 AGREE_SIGMAS = 3.0  # less is no reason to change the bench file
 # Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag
 # rms from the truth.
@@ -204,12 +205,16 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
 
 
 def _twin(context: StepContext) -> TwinVerdict:
-    """The twin's verdict; its black level is judged no closer than the session knows the light
-    of white, by which it glows.
+    """The twin's verdict; its black level is judged no closer than the session knows it, and the
+    light of white, by which it glows.
     """
     twin_run = run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
     glow = twin_run.measured.glow
-    known = float(context.known.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
+    figures = context.known
+    known = float(figures.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
+    black = float(figures.get(BLACK_LEVEL, 0.0))
+    if black > 0:
+        known = math.hypot(known, float(figures.get(BLACK_ERROR, 0.0)) / black)
     limit = max(glow.limit_e_per_s_px, AGREE_SIGMAS * known * glow.assumed_e_per_s_px)
     return judge(
         dataclasses.replace(

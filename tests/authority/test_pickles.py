@@ -226,7 +226,7 @@ def test_most_of_hipparcos_s_vi_is_the_usual_one_of_its_bv():
     catalog = load_catalog()
     kept = (catalog.v_mag <= SHOWN_V_MAG) & np.isfinite(catalog.bv_mag)
     bv_mag, vi_mag = catalog.bv_mag[kept], catalog.vi_mag[kept]
-    alike = np.array_split(np.argsort(bv_mag), 200)
+    alike = np.array_split(np.argsort(bv_mag, kind="stable"), 200)
     usual = np.interp(
         bv_mag, [np.median(bv_mag[k]) for k in alike], [np.median(vi_mag[k]) for k in alike]
     )

@@ -331,8 +331,7 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
     sky = {"epoch_jyear": 2026.0, "faintest_v_mag": bench.faintest_v_mag}
     render = {"brightest_v_mag": round(max(1.5, bench.faintest_v_mag - DECADES_FAINTER), 1)}
     tables: dict[str, dict[str, Any]] = {
-        "tracker": tracker,
-        "tracker.detector": sensor,
+        "tracker": tracker | {"detector": sensor},
         "sky": sky,
         "monitor": monitor,
         "collimator": {"focal_length_mm": round(bench.collimator_mm, 2)},
@@ -348,8 +347,7 @@ def write_bench(bench: DrawnBench, folder: Path) -> tuple[Path, Path]:
         "device_seed": 1,
     }
     truth = tables | {
-        "tracker": tracker | {"psf_sigma_px": [detector.psf_px] * 2},
-        "tracker.detector": true_sensor,
+        "tracker": tracker | {"psf_sigma_px": [detector.psf_px] * 2, "detector": true_sensor},
         "monitor": (
             monitor
             | {

@@ -22,7 +22,8 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_matrix, to_matrix
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
-from hilstar.display.panel import Panel, shown_light
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import shown_light
 from hilstar.display.response import Levels
 from hilstar.instruments.calibrate.first_light.context import MAX_FILL, StepContext
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern

@@ -41,6 +41,7 @@ def sender(tmp_path_factory) -> Path:
     return target
 
 
+@pytest.mark.timing
 def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
     address, port = "::1", free_port()
     bench = tmp_path / "udp.toml"

@@ -19,7 +19,7 @@ from dataclasses import replace
 from hilstar.display.render.numpy_backend import NumpyBackend, open_backend
 from hilstar.display.render.presenter import window_context
 from hilstar.display.render.renderer import Renderer
-from hilstar.optics.frame_motion import Orientation
+from hilstar.optics.scan import Orientation
 from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 

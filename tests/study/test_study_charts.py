@@ -187,11 +187,11 @@ def outcome(frame_ms: float, worst_mag: float = 0.01, bits: int = 8) -> EffortOu
     [
         (
             ((2.0, 1.0), (10.0, 2.0)),
-            "is 2.0 at 8, 5.0 at 10 bits times as fast as full effort (2.0 to 5.0 over",
+            "At 8, 10 bits auto effort is 2.0, 5.0 times as fast as full effort (2.0 to 5.0 over",
         ),
         (
             ((0.5, 1.0), (10.0, 2.0)),
-            "is 0.5 at 8, 5.0 at 10 bits times as fast as full effort (0.5 to 5.0 over",
+            "At 8, 10 bits auto effort is 0.5, 5.0 times as fast as full effort (0.5 to 5.0 over",
         ),
     ],
 )

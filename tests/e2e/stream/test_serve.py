@@ -62,7 +62,7 @@ SUMMARY_KEYS |= {
 
 @pytest.mark.timing
 def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
-    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes
+    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, an old count, and bytes
     of no form.
     """
     with (
@@ -94,7 +94,8 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
         "crc": 100,
         "norm": 100,
         "nan": 100,
-        "time": 100,
+        # a count that comes twice, at another time, is a second sender's
+        "source": 100,
         "format": 100,
     }
     assert packets["refused"] == 500

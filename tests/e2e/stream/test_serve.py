@@ -96,6 +96,7 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
         "nan": 100,
         # a count that comes twice, at another time, is a second sender's
         "source": 100,
+        "time": 0,
         "format": 100,
     }
     assert packets["refused"] == 500

@@ -62,6 +62,7 @@ COLUMN_UNITS = {
     "_d": "day",
     "_k": "K",
 }
+ROUNDING = 1e-6  # of a unit quaternion that is written with seven digits
 PICTURE_PX = 640  # width of a picture in a notebook
 # A bench without a file: what messages call it, in the current folder.
 FROM_TABLES, FROM_CONFIG = Path("dictionary"), Path("configuration")
@@ -213,6 +214,16 @@ class SkyFrame(Frame):
         return f'{image}{picture}">{_figures_html(figures)}'
 
 
+def _unit_quaternion(q_icrs_to_cam: FloatArray) -> FloatArray:
+    """A quaternion as it was given where its norm is 1, as its last bits choose between codes that
+    are as good; else normalised. Raises InputError as `checked_quaternion`.
+    """
+    unit = checked_quaternion(q_icrs_to_cam)
+    if np.abs(unit - q_icrs_to_cam).max() < ROUNDING:
+        return q_icrs_to_cam
+    return unit
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class OpenBench(Bench):
     """A bench, open: it draws frames, simulates its tracker, and is verified. Free it with `close`,
@@ -281,10 +292,11 @@ class OpenBench(Bench):
         """
         if q_icrs_to_cam is None and roll_deg is not None:
             raise InputError("draw: a blank frame has no roll; leave roll_deg out")
+        q = None
+        if q_icrs_to_cam is not None:
+            q = _unit_quaternion(quaternion_of(q_icrs_to_cam, roll_deg))
         return super().draw(
-            None
-            if q_icrs_to_cam is None
-            else checked_quaternion(quaternion_of(q_icrs_to_cam, roll_deg)),
+            q,
             whole_of(frame, "frame"),
             None if rate_cam_rad_s is None else rate_of(rate_cam_rad_s),
             None if t_ns is None else t_ns_of(t_ns),

@@ -61,6 +61,7 @@ def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Scree
         camera=SimpleNamespace(boresight_px=(0.0, 0.0)),
         calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
         renderer=WellGpu(model.wait),
+        effort=SimpleNamespace(is_chosen=False),
         draw=lambda q: None,
         view=View,
         light=lambda view, faults: clock.work(DRAW_NS),

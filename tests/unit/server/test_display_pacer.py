@@ -81,7 +81,12 @@ class Run:
         self._cost = cost
         config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
         bench = SimpleNamespace(
-            config=config, renderer=WellGpu(), view=View, light=self._light, draw_sprites=self._draw
+            effort=SimpleNamespace(is_chosen=False),
+            config=config,
+            renderer=WellGpu(),
+            view=View,
+            light=self._light,
+            draw_sprites=self._draw,
         )
         self.loop = FrameLoop(bench, self.shown.append, self.pacer, notices=self.notices)
         self.loop.paced(limit, self._draw_slot)

@@ -14,6 +14,7 @@ from hilstar.basics.rotation import to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.panel import Panel
 from hilstar.display.response import gamma_response, table_response
+from hilstar.instruments.simulate import bench_geometry
 from hilstar.instruments.simulate import optics as twin_optics
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
@@ -117,7 +118,7 @@ def test_a_monitor_pixel_is_seen_where_its_direction_is_whatever_the_lenses_do(g
 
 def test_the_places_of_a_large_detector_are_found_in_blocks(geometry, monkeypatch):
     """All pixels of 2048 x 2048 at once took 0.5 GB of intermediate values, and a session 2.6."""
-    monkeypatch.setattr(twin_optics, "PIXELS_AT_ONCE", 10_000)
+    monkeypatch.setattr(bench_geometry, "PIXELS_AT_ONCE", 10_000)
     y_px, x_px = np.mgrid[0:300, 0:400].reshape(2, -1).astype(np.float64)
     tracemalloc.start()
     try:

@@ -19,8 +19,11 @@ from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
 from tests.support.waiting import PATIENCE_S
 
-# As strict as compilers are, besides what the README gives.
+# The port is bound before the bench is opened, which may take a second: what is sent meanwhile is
+# read, and answered late.
+STREAM_S = 5
 READ_S = 0.5  # until a busy machine has read what was sent
+# As strict as compilers are, besides what the README gives.
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow", "-fno-exceptions"]
 
 
@@ -41,7 +44,6 @@ def sender(tmp_path_factory) -> Path:
     return target
 
 
-@pytest.mark.timing
 def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
     address, port = "::1", free_port()
     bench = tmp_path / "udp.toml"
@@ -49,18 +51,18 @@ def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
         f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n'
     )
     with listening(bench, "bound to") as process:
-        command = [sender, address, str(port), "100", "1", "5"]
+        command = [sender, address, str(port), "100", str(STREAM_S), "5"]
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
         )
         time.sleep(READ_S)
         summary = interrupted(process)
-    match = re.fullmatch(r"sent 100, requests (\d+), statuses (\d+)\n", result.stdout)
+    match = re.fullmatch(rf"sent {100 * STREAM_S}, requests (\d+), statuses (\d+)\n", result.stdout)
     assert match is not None, result.stdout
-    # A second has 8 quick time requests and 10 statuses, less what the start took.
+    # A second has 8 quick time requests and 10 statuses.
     assert int(match[1]) >= 4
     assert int(match[2]) >= 4
-    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 100
+    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 100 * STREAM_S
     assert summary["clock"]["mode"] == "exchange"
     # Both processes have the same clock.
     assert abs(summary["clock"]["offset_ms"]) <= summary["clock"]["uncertainty_ms"] + 1.0

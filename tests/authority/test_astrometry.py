@@ -128,7 +128,9 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
         seen = erfa.ab(natural, beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta))
         x_px, y_px = bench.camera.project(seen @ rotation.T)
         assert len(sprites) > 30
-        assert np.hypot(x_px - sprites.x_px, y_px - sprites.y_px).max() < ORBIT_LIMIT_PX
+        # Two boosts one after the other are one boost and a rotation by half of beta x beta':
+        # 1.4e-9 rad for the Earth and an orbit about it. Of 1041 px to a radian that is 1.4e-6 px.
+        holds("orbit-stars", np.hypot(x_px - sprites.x_px, y_px - sprites.y_px).max())
     # The orbit's own 5 arcsec are 0.025 px.
     plain = bench.light(bench.view(q))
     assert plain is not None

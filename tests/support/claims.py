@@ -30,7 +30,6 @@ from tools.claims import (
     Claim,
     Table,
     claims_of,
-    last_digit,
     pages_of,
     tables_of,
 )
@@ -43,6 +42,7 @@ FIGURE = re.compile(rf"(?<![\w.-])({NUMBER})\s(arcsec|mas|px|mag|%)(?![\w/])")
 NO_PROSE = re.compile(
     r"^```.*?^```$|<!-- table: \w+ -->.*?<!-- end -->|`[^`\n]*`", re.MULTILINE | re.DOTALL
 )
+LAST_ROUNDED = 0.005  # last values have three digits
 TABLE = re.compile(r"<!-- table: (\w+) -->")
 IMPORTED = re.compile(r"^ *(?:from|import) (\w+)", re.MULTILINE)
 
@@ -169,7 +169,7 @@ def faults_of_row(claim: Claim) -> list[str]:
     low, high = claim.bound()
     lasts = claim.lasts()
     largest = max(lasts)
-    step = last_digit(f"{largest:.3g}") / 2
+    rounding = LAST_ROUNDED * abs(largest)
     limit = float(claim.value.split(" to ")[-1].replace(" ", ""))
     is_limit = claim.sense == AT_MOST and " to " not in claim.value
     rules = {
@@ -177,7 +177,7 @@ def faults_of_row(claim: Claim) -> list[str]:
         "the oracle is of no known kind": claim.oracle in (*INSIDE, *OUTSIDE),
         "the sense is neither 'at most' nor 'about'": claim.sense in (AT_MOST, ABOUT),
         f"the last value {claim.last} is out of {low:.4g} to {high:.4g}": (
-            low - step <= min(lasts) and largest <= high + step
+            low - rounding <= min(lasts) and largest <= high + rounding
         ),
         f"the last value {claim.last} is under half of {claim.figure()}, and no `why` says so": (
             not is_limit or bool(claim.why) or largest >= MIN_OF_LIMIT * limit

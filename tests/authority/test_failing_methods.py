@@ -139,3 +139,4 @@ def test_weak_perspective_errs_by_half_the_angle_cubed():
     wide = math.radians(10.0)
     assert far_px == pytest.approx(-350e3 / 57.65 * (math.tan(wide) - math.sin(wide)), rel=1e-9)
     holds("weak-perspective", -far_px)
+    holds("weak-perspective-5", -field.weak_perspective_error(np.array([5.0]))[0][0])

@@ -137,7 +137,8 @@ def test_too_few_oracles_outside_are_found(falsified):
     assert any("figures have an outside oracle" in one for one in found)
 
 
-def test_a_measured_value_has_to_leave_the_figure_true():
+def test_a_measured_value_has_to_leave_the_figure_true(monkeypatch):
+    monkeypatch.delenv(support.RECORDS, raising=False)  # what is planted here was not measured
     low, high = rows()[ROW].bound()
     holds(ROW, high)
     with pytest.raises(
@@ -168,3 +169,13 @@ def test_values_of_a_run_become_the_last_ones(tmp_path, monkeypatch):
     assert [one.id for one in changed] == [ROW]
     assert (changed[0].last, changed[0].date) == (0.0064, today)
     assert changed[0].version == lines[0]["version"] != ""
+
+
+def test_a_run_that_measures_less_or_nothing_is_found():
+    """As a test whose value is divided by ten would, which is within any upper limit."""
+    row = rows()[ROW]
+    whole = [{"claim": ROW, "value": str(row.last), "version": ""}]
+    tenth = [{"claim": ROW, "value": str(float(row.last) / 10), "version": ""}]
+    assert tool.strayed([row], whole) == []
+    assert tool.strayed([row], tenth) == [f"{ROW}: 0.000663, and 0.00663 before"]
+    assert tool.strayed([row], []) == [f"{ROW}: {row.test} did not measure it"]

@@ -37,7 +37,7 @@ from tools.claims import (
 RECORDS = "HILSTAR_CLAIMS"
 # The pages on which each figure with an accuracy's unit has its mark
 MARKED_PAGES = ("README.md", "docs/accuracy-speed.md")
-FIGURE = re.compile(rf"(?<![\w.-])({NUMBER})\s(arcsec|mas|px|mag|%)(?![\w/])")
+FIGURE = re.compile(rf"(?<![\w.-])({NUMBER})\s?(arcsec|mas|px|mag|%)(?![\w/])")
 # what is no prose: blocks of code, tables that a script makes, code in a line
 NO_PROSE = re.compile(
     r"^```.*?^```$|<!-- table: \w+ -->.*?<!-- end -->|`[^`\n]*`", re.MULTILINE | re.DOTALL

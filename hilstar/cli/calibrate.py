@@ -71,7 +71,6 @@ def dots(
     """
     import numpy as np
 
-    from hilstar.instruments.calibrate.geometric.calibration import seen_screen_of
     from hilstar.instruments.calibrate.geometric.dots import (
         dot_image,
         lit_for,
@@ -79,6 +78,7 @@ def dots(
         show_dots,
         write_plan,
     )
+    from hilstar.instruments.calibrate.geometric.geometry_fit import seen_screen_of
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.frame_files import write_codes_png
 
@@ -145,7 +145,7 @@ def geometric(
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker
     saw.
     """
-    from hilstar.instruments.calibrate.geometric.calibration import (
+    from hilstar.instruments.calibrate.geometric.geometry_fit import (
         calibrate_files,
         lines_of,
         summary_of,

@@ -154,7 +154,7 @@ def _certify(
     from hilstar.instruments.certify.certificate import certify as certified
     from hilstar.instruments.certify.check import largest_changes, watch
     from hilstar.instruments.certify.page import text_lines, write_certificate_page
-    from hilstar.server.bench.certificate import read_certificate
+    from hilstar.server.bench.certificate_file import read_certificate
 
     path = output / CERTIFICATE
     replaces = None
@@ -204,7 +204,7 @@ def _check(
         take_check,
         watch,
     )
-    from hilstar.server.bench.certificate import read_certificate
+    from hilstar.server.bench.certificate_file import read_certificate
 
     reference = read_reference(output / REFERENCE)
     since = "the bench file"

@@ -51,8 +51,8 @@ def confront(
     """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts
     against them.
     """
-    from hilstar.instruments.confront.files import read_tracker_file
     from hilstar.instruments.confront.images import parse_utc
+    from hilstar.instruments.confront.measured_bench import read_tracker_file
     from hilstar.instruments.confront.run import OUTPUTS
     from hilstar.instruments.confront.run import confront as confront_files
     from hilstar.server.bench.bench_file import BenchFile as ReadFile

@@ -48,7 +48,7 @@ def answers(
         float | None,
         Option(
             "--seconds",
-            metavar="S",
+            metavar="SECONDS",
             help="End after so long; by default with Ctrl-C.",
             min=0.1,
             max=1e7,

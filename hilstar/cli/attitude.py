@@ -47,7 +47,8 @@ def attitude(
         ),
     ] = None,
     wait: Annotated[
-        float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)
+        float,
+        Option(metavar="SECONDS", help="How long to wait for a live stream.", min=0.1, max=1e6),
     ] = 10.0,
     statements: options.LogStatements = options.NOTHING_STATED,
     explain: Annotated[

@@ -26,11 +26,12 @@ def budget(
     centroider: Annotated[
         str | None,
         Option(
+            metavar="NAME",
             help=(
                 "Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or"
                 " box5 (centres of mass), or "
                 "all of them; what the bench has under verify, or fit, unless given."
-            )
+            ),
         ),
     ] = None,
     noise: Annotated[

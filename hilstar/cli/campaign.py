@@ -45,7 +45,9 @@ def campaign(
     ],
     workers: Annotated[
         int | None,
-        Option(help="Processes on this machine; by default one a core.", min=1, max=1024),
+        Option(
+            metavar="N", help="Processes on this machine; by default one a core.", min=1, max=1024
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -78,7 +80,7 @@ def campaign(
         ),
     ] = CENTROIDS,
     solver_timeout: Annotated[
-        float, Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)
+        float, Option(metavar="SECONDS", help="Time limit of one image, s.", min=0.01, max=86400)
     ] = 10.0,
     images: Annotated[
         Literal["fits"] | None, Option(help="Keep the images, with their truth.")

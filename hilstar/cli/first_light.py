@@ -14,11 +14,11 @@ from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.image_source import image_source, virtual_truth
 from hilstar.cli.options import (
-    MAX_SEED,
     BenchFile,
     Json,
     check_files,
     frames_of,
+    seed_option,
 )
 from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
 from hilstar.server.console.terminal import print_found, say
@@ -116,9 +116,7 @@ def first_light(
     again: Annotated[
         list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")
     ] = None,
-    seed: Annotated[
-        int, Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)
-    ] = 0,
+    seed: Annotated[int, seed_option("With --virtual: seed of the tracker's noise.")] = 0,
     force: Force = False,
     console: Console = None,
     control: Control = False,

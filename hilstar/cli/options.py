@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from typer import Argument, Option
 
-from hilstar.basics.errors import InputError, did_you_mean
+from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 from hilstar.basics.units import NS_PER_S
 
@@ -55,7 +55,9 @@ Explain = Annotated[
 AtSeconds = Annotated[
     float | None,
     Option(
-        "--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default."
+        "--at",
+        metavar="SECONDS",
+        help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.",
     ),
 ]
 RunFile = Annotated[Path, Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
@@ -123,6 +125,18 @@ USUAL_ADDRESSES = {
     "--scpi": "127.0.0.1:5025",
     "--camera": "127.0.0.2",
 }
+
+
+def checked_seed(seed: int) -> int:
+    """The seed of an option. Raises InputError where it is too large."""
+    if seed > MAX_SEED:
+        raise InputError(f"--seed {shortened(str(seed))}: write 0 to {MAX_SEED}")
+    return seed
+
+
+def seed_option(meaning: str) -> Any:
+    """The option of a seed, a whole number from 0 to MAX_SEED."""
+    return Option(metavar="SEED", help=meaning, min=0, callback=checked_seed)
 
 
 def check_files(

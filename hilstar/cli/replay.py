@@ -24,13 +24,16 @@ def replay(
         ),
     ] = "realtime",
     start: Annotated[
-        float | None, Option(metavar="S", help="Start this many seconds after the first sample.")
+        float | None,
+        Option(metavar="SECONDS", help="Start this many seconds after the first sample."),
     ] = None,
     stop: Annotated[
-        float | None, Option(metavar="S", help="Stop this many seconds after the first sample.")
+        float | None,
+        Option(metavar="SECONDS", help="Stop this many seconds after the first sample."),
     ] = None,
     step: Annotated[
-        float | None, Option(metavar="S", help="Time step of the log between frames, in seconds.")
+        float | None,
+        Option(metavar="SECONDS", help="Time step of the log between frames, in seconds."),
     ] = None,
     statements: options.LogStatements = options.NOTHING_STATED,
     headless: options.Headless = False,

@@ -48,11 +48,15 @@ def send(
         Option("--connect", help="Connect instead of binding, for a bench file with bind = true."),
     ] = False,
     radec: options.RadecText = None,
-    count: Annotated[int | None, Option(help="Stop after this many packets.", min=1)] = None,
-    duration: Annotated[
-        float | None, Option(metavar="S", help="Stop after this many seconds.", min=0)
+    count: Annotated[
+        int | None, Option(metavar="N", help="Stop after this many packets.", min=1)
     ] = None,
-    wait: Annotated[float, Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
+    duration: Annotated[
+        float | None, Option(metavar="SECONDS", help="Stop after this many seconds.", min=0)
+    ] = None,
+    wait: Annotated[
+        float, Option(metavar="SECONDS", help="Seconds to wait for a listener.", min=0, max=1e6)
+    ] = 30.0,
     sender: Annotated[
         int,
         Option(
@@ -71,7 +75,7 @@ def send(
             metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6
         ),
     ] = 0.0,
-    seed: Annotated[int, Option(help="Seed of the faults.", min=0, max=options.MAX_SEED)] = 0,
+    seed: Annotated[int, options.seed_option("Seed of the faults.")] = 0,
     secret_key: KeyFile = None,
     server_key: KeyFile = None,
     allowed_clients: Annotated[

@@ -148,7 +148,8 @@ def serve(
     bench_file: BenchFile,
     headless: Headless = False,
     duration: Annotated[
-        float | None, Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)
+        float | None,
+        Option(metavar="SECONDS", help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8),
     ] = None,
     frames: Annotated[
         list[str] | None,

@@ -34,12 +34,14 @@ def simulate(
     ] = None,
     frames: Annotated[
         int | None,
-        Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1),
+        Option(
+            metavar="N",
+            help="With --log: this many, evenly spaced; by default one for each sample.",
+            min=1,
+        ),
     ] = None,
     statements: options.LogStatements = options.NOTHING_STATED,
-    seed: Annotated[
-        int, Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)
-    ] = 0,
+    seed: Annotated[int, options.seed_option("Seed of the frame's noise.")] = 0,
     noise: Annotated[
         Literal["full", "none"], Option(help="The detector's full noise, or none.")
     ] = "full",

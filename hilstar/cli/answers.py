@@ -44,12 +44,12 @@ def answers(
     ] = False,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
-    seconds: Annotated[
+    duration: Annotated[
         float | None,
         Option(
-            "--seconds",
+            "--duration",
             metavar="SECONDS",
-            help="End after so long; by default with Ctrl-C.",
+            help="Seconds to run; by default until Ctrl-C.",
             min=0.1,
             max=1e7,
         ),
@@ -81,7 +81,7 @@ def answers(
     if shown is None and explain and recorded is None:
         shown = _shown_now(file)
     if recorded is None:
-        decoder, answer_stream = _live(plan, seconds)
+        decoder, answer_stream = _live(plan, duration)
     else:
         decoder = plan.decoder(messages=False)
         answer_stream = recorded_answers(plan, decoder, recorded)

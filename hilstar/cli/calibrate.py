@@ -57,7 +57,7 @@ def dots(
         bool,
         Option("--show", help="Show the frames on the display: space for the next, q to quit."),
     ] = False,
-    seconds: Annotated[
+    dwell: Annotated[
         float | None,
         Option(metavar="SECONDS", help="With --show: time for each frame, without keys.", min=0),
     ] = None,
@@ -100,7 +100,7 @@ def dots(
         write_codes_png(output / f"frame_{frame:03}.png", image, monitor.bits)
     shown = None
     if show:
-        shown = show_dots(plan, monitor, seconds, windowed=windowed)
+        shown = show_dots(plan, monitor, dwell, windowed=windowed)
         say(f"{shown} of {plan.frames} frames shown")
     summary = {
         "frames": plan.frames,
@@ -336,7 +336,7 @@ def plan(
         bool, Option("--show", help="Show the patches on a display: space for the next, q to quit.")
     ] = False,
     display: Annotated[str, Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
-    seconds: Annotated[
+    dwell: Annotated[
         float | None,
         Option(metavar="SECONDS", help="With --show: time for each patch, without keys.", min=0),
     ] = None,
@@ -382,9 +382,7 @@ def plan(
     }
     print_found(as_json, summary, [line, advice])
     if show:
-        shown = show_patches(
-            planned, bits, int(display) if display.isdecimal() else display, seconds
-        )
+        shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, dwell)
         say(f"{shown} of {len(planned)} patches shown")
     elif headless is None:
         say(

@@ -39,9 +39,11 @@ def confront(
     ] = False,
     radec: RadecText = None,
     quaternion: QuaternionText = None,
-    at: Annotated[
+    taken: Annotated[
         str | None,
-        Option("--at", metavar="UTC", help="When the images were taken, where they do not say it."),
+        Option(
+            "--taken", metavar="UTC", help="When the images were taken, where they do not say it."
+        ),
     ] = None,
     as_json: Json = False,
     strict: Annotated[
@@ -62,7 +64,7 @@ def confront(
         start = None
     else:
         start = parse_attitude("confront", radec, quaternion)
-    at_ns = None if at is None else parse_utc(at)
+    at_ns = None if taken is None else parse_utc(taken)
     file: ReadFile = read_tracker_file(bench_file)[0]
     check_files(images, [output / name for name in OUTPUTS], file)
     tell = (lambda line: None) if as_json else typer.echo

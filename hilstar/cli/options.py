@@ -181,26 +181,6 @@ def with_values(words: list[str]) -> list[str]:
     return complete
 
 
-def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str | None]:
-    """What --frames asks for: how many frames, and where they are sent to. Raises InputError."""
-    form = (
-        "write a number of frames, or an endpoint such as tcp://127.0.0.1:5570; both may be given"
-    )
-    counts = [text for text in asked or () if "://" not in text]
-    endpoints = [text for text in asked or () if "://" in text]
-    for kind in (counts, endpoints):
-        if len(kind) > 1:
-            raise InputError(f"--frames {kind[0]} and --frames {kind[1]}: {form}")
-    if counts and not (counts[0].isdecimal() and int(counts[0]) > 0):
-        raise InputError(f"--frames {counts[0]}: {form}")
-    if endpoints and heads:
-        raise InputError(
-            f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or"
-            " leave it out"
-        )
-    return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
-
-
 def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
     """The one attitude that the command line gives."""
     from hilstar.basics.rotation import from_radec_roll_deg

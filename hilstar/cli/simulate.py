@@ -22,7 +22,7 @@ def simulate(
     bench_file: options.BenchFile,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
-    rate: Annotated[
+    slew: Annotated[
         str | None,
         Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s."),
     ] = None,
@@ -66,9 +66,9 @@ def simulate(
     from hilstar.server.bench.bench_file import at_moment, read_bench_file
 
     if log is not None:
-        if output is None or radec or quaternion or rate or png or dn_png or at is not None:
+        if output is None or radec or quaternion or slew or png or dn_png or at is not None:
             raise InputError(
-                "simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png"
+                "simulate --log LOG: give -o DIR, and no --radec, --quaternion, --slew, --at, --png"
                 " or --dn-png"
             )
         check_directory("-o", output)
@@ -89,8 +89,8 @@ def simulate(
     q = options.parse_attitude("simulate", radec, quaternion)
     t_ns = options.parse_at("simulate", at, file.config, wrong is not None)
     file = at_moment(file, t_ns)
-    if rate:
-        rate_rad_s = np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s"))
+    if slew:
+        rate_rad_s = np.radians(options.parse_numbers(slew, 3, "--slew", "X,Y,Z in deg/s"))
     else:
         rate_rad_s = np.zeros(3)
     with Simulator(file) as simulator:

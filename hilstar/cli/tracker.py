@@ -40,7 +40,7 @@ def tracker(
     bench_file: options.BenchFile,
     watch: Annotated[
         str,
-        Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from."),
+        Option(metavar="ENDPOINT", help="Where serve or replay --feed sends its frames from."),
     ],
     answer: Annotated[
         str | None,

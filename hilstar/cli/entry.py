@@ -31,7 +31,8 @@ READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1
 INPUT_ENDINGS = (".toml", ".mcap", ".csv", ".json", ".jsonl", ".fits", ".png", ".aem")
 # several numbers, with commas
 NUMBER_OPTIONS = ("--radec", "--quaternion", "--slew", "--place", "--mounting", "--reading")
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+# degrees, or sexagesimal
+NUMBER = r"[-+]?(?:\d[\d.:hdms]*|\.\d+)(?:[eE][-+]?\d+)?"
 # a word that a shell makes of numbers with spaces between them
 NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")
 ELSEWHERE = dict.fromkeys(

@@ -35,13 +35,6 @@ Json = Annotated[
     bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")
 ]
 Headless = Annotated[bool, Option("--headless", help="Draw without a window.")]
-RadecText = Annotated[
-    str | None,
-    Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS."),
-]
-QuaternionText = Annotated[
-    str | None, Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")
-]
 Overwrite = Annotated[
     bool, Option("--overwrite", help="Replace an existing file that could not be made again.")
 ]
@@ -181,20 +174,6 @@ def with_values(words: list[str]) -> list[str]:
     return complete
 
 
-def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
-    """The one attitude that the command line gives."""
-    from hilstar.basics.rotation import from_radec_roll_deg
-    from hilstar.server.bench.frame import checked_quaternion
-
-    if (radec is None) == (quaternion is None):
-        raise InputError(
-            f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z"
-        )
-    if radec is not None:
-        return from_radec_roll_deg(*parse_radec(radec))
-    return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
-
-
 def parse_at(
     command: str, at_s: float | None, config: "BenchConfig", timed: bool = False
 ) -> int | None:
@@ -227,14 +206,6 @@ def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
     return numbers
-
-
-def parse_radec(text: str) -> tuple[float, float, float]:
-    """Right ascension, declination and roll in degrees."""
-    ra_deg, dec_deg, roll_deg = parse_numbers(text, 3, "--radec", "RA,DEC,ROLL in degrees")
-    if not -90 <= dec_deg <= 90:
-        raise InputError(f"--radec {text}: write a declination from -90 to 90")
-    return ra_deg, dec_deg, roll_deg
 
 
 def parse_spin(text: str) -> "FloatArray":

@@ -16,8 +16,10 @@ from hilstar.basics.process.interrupts import is_command, stop_on_signal
 from hilstar.basics.process.scheduling import PromptWhileLight
 from hilstar.basics.units import NS_PER_S
 from hilstar.cli import options
+from hilstar.cli.pointing import RadecText, StarText, place_of
 from hilstar.server.console.terminal import print_json, progress, say
 
+ORION_DEG = (84.057, -1.2, 0.0)  # RA, Dec and roll where a spin begins
 LISTEN_SLICE_S = 0.1  # between checks for a signal
 Share = Annotated[
     str,
@@ -47,7 +49,8 @@ def send(
         bool,
         Option("--connect", help="Connect instead of binding, for a bench file with bind = true."),
     ] = False,
-    radec: options.RadecText = None,
+    radec: RadecText = None,
+    star: StarText = None,
     count: Annotated[
         int | None, Option(metavar="N", help="Stop after this many packets.", min=1)
     ] = None,
@@ -101,7 +104,7 @@ def send(
             "send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller"
             " fractions"
         )
-    samples, total = wanted_samples(log, spin, rate, radec, statements)
+    samples, total = wanted_samples(log, spin, rate, place_of("send", radec, star), statements)
     if duration is not None:
         samples = takewhile(lambda sample: sample.t_ns < duration * NS_PER_S, samples)
     stop = threading.Event()
@@ -137,7 +140,7 @@ def wanted_samples(
     log: Path | None,
     spin: str | None,
     rate: float | None,
-    radec: str | None,
+    place: tuple[float, float, float] | None,
     statements: options.LogStatements,
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
@@ -154,7 +157,7 @@ def wanted_samples(
             spin_samples(
                 options.parse_spin(spin),
                 rate or 100.0,
-                options.parse_radec(radec or "84.057,-1.2,0"),
+                place or ORION_DEG,
             ),
             math.inf,
         )

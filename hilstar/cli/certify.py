@@ -13,7 +13,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory, write_whole
 from hilstar.basics.reading import exists
 from hilstar.cli.image_source import image_source, virtual_truth
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
+from hilstar.cli.options import BenchFile, Json, check_files, seed_option
 from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def certify(
         float,
         Option(
             "--warm-up",
-            metavar="MIN",
+            metavar="MINUTES",
             min=0,
             max=240,
             help="Watch white for up to so long, until it is stable.",
@@ -88,9 +88,7 @@ def certify(
     quick: Annotated[
         bool, Option("--quick", help="Few trials: first order is enough where the model is linear.")
     ] = False,
-    seed: Annotated[
-        int, Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)
-    ] = 0,
+    seed: Annotated[int, seed_option("With --virtual: seed of the readings' noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """State how sure a bench is: the light, places, attitude and latency of stars, with the

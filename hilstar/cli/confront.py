@@ -10,11 +10,9 @@ from hilstar.basics.files import check_directory
 from hilstar.cli.options import (
     BenchFile,
     Json,
-    QuaternionText,
-    RadecText,
     check_files,
-    parse_attitude,
 )
+from hilstar.cli.pointing import QuaternionText, RadecText, StarText, optional_attitude
 from hilstar.server.console.terminal import print_found, say
 
 
@@ -38,10 +36,13 @@ def confront(
         ),
     ] = False,
     radec: RadecText = None,
+    star: StarText = None,
     quaternion: QuaternionText = None,
-    at: Annotated[
+    taken: Annotated[
         str | None,
-        Option("--at", metavar="UTC", help="When the images were taken, where they do not say it."),
+        Option(
+            "--taken", metavar="UTC", help="When the images were taken, where they do not say it."
+        ),
     ] = None,
     as_json: Json = False,
     strict: Annotated[
@@ -58,12 +59,10 @@ def confront(
     from hilstar.server.bench.bench_file import BenchFile as ReadFile
 
     check_directory("-o", output)
-    if radec is None and quaternion is None:
-        start = None
-    else:
-        start = parse_attitude("confront", radec, quaternion)
-    at_ns = None if at is None else parse_utc(at)
+    at_ns = None if taken is None else parse_utc(taken)
     file: ReadFile = read_tracker_file(bench_file)[0]
+    epoch_jyear = file.config.sky.epoch_jyear
+    start = optional_attitude("confront", radec, star, quaternion, epoch_jyear)
     check_files(images, [output / name for name in OUTPUTS], file)
     tell = (lambda line: None) if as_json else typer.echo
     confronted = confront_files(

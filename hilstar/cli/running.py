@@ -123,10 +123,17 @@ ConsoleName = Annotated[
         help="A further name of the page, as a proxy shows it; may be given often.",
     ),
 ]
-FRAMES_HELP = (
-    "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar"
-    " tracker)"
-)
+Feed = Annotated[
+    str | None,
+    Option(
+        "--feed",
+        metavar="ENDPOINT",
+        help=(
+            "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570"
+            " (hilstar tracker)."
+        ),
+    ),
+]
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:

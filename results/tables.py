@@ -496,7 +496,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim",)
+BESIDE = ("galsim", "astrometry")
 
 
 def beside_table(name: str) -> str:

@@ -20,6 +20,7 @@ from tests.support.beside.steps import write_beside
 # What each needs that `pip install -e '.[dev]'` does not bring.
 PROGRAMS = {
     "galsim": "",
+    "astrometry": "Debian's astrometry.net",
 }
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from hilstar.basics.errors import MachineError
+from tests.support.beside import astrometry_side
 from tests.support.beside.steps import Beside
 
 # float32 shares are within MAX_SHARE_ERROR (1e-7) by polynomial, and 1.2e-7 of rounding
@@ -16,6 +18,12 @@ PINHOLE_PX = 1e-9
 # a zero point's digits, and linear tables every 0.5 nm
 ELECTRONS = 2e-6
 SIGMAS = 4.0
+# the index's and the list's doubles, and TAN's own digits; 3e-6 was measured
+PLACES_ARCSEC = 1e-4
+# a centroid of 0.1 px or 4 arcsec, of 40 stars or more
+IMAGE_ARCSEC = 1.0
+# of 2.6 px at the corner: k1's r^3 is all of order 3, but for the projection's own
+BENT_PX, FREE_PX = 2e-3, 0.1
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +64,24 @@ def test_galsim_s_noise_has_hilstar_s_variance_and_distribution(galsim):
     assert galsim.size(subject, "and rounded") < SIGMAS * galsim.size(subject, "one sigma")
     subject = "noise: distribution of DN"
     assert galsim.size(subject, "and rounded") < galsim.size(subject, "by chance")
+
+
+@pytest.fixture(scope="module")
+def astrometry(tmp_path_factory) -> Beside:
+    try:
+        astrometry_side.solver_version()
+    except MachineError as error:
+        pytest.skip(str(error))
+    return astrometry_side.run(tmp_path_factory.mktemp("astrometry"), quick=True)
+
+
+def test_astrometry_net_solves_exposures_to_the_attitude_drawn(astrometry):
+    subject = "attitude: across the boresight"
+    assert astrometry.size(subject, "hilstar's places, a fit") < PLACES_ARCSEC
+    assert astrometry.size(subject, "a fit to all its centroids") < IMAGE_ARCSEC
+
+
+def test_astrometry_net_s_sip_follows_a_lens(astrometry):
+    subject = "distortion of a lens, over the image"
+    assert astrometry.size(subject, "without its SIP") > FREE_PX
+    assert astrometry.size(subject, "hilstar's places, SIP of order 3") < BENT_PX

@@ -20,6 +20,7 @@ from hilstar.basics.files import (
     make_directory,
     refuse_stdout,
 )
+from hilstar.cli.image_source import Exposure, Grab, ShownTo, dot_images
 from hilstar.cli.options import (
     BenchFile,
     Json,
@@ -117,17 +118,21 @@ def dots(
 
 def geometric(
     bench_file: BenchFile,
-    observed: Annotated[
-        list[Path],
-        Argument(
-            metavar="OBSERVED...",
-            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.",
-        ),
-    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
     output: Annotated[
         Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
     ],
+    observed: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="OBSERVED...",
+            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images; none with --grab.",
+        ),
+    ] = None,
+    grab: Grab = None,
+    exposure: Exposure = None,
+    feed: ShownTo = None,
+    overwrite: Overwrite = False,
     tracker_is_ideal: Annotated[
         bool,
         Option(
@@ -136,7 +141,11 @@ def geometric(
         ),
     ] = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="A dark frame, taken from each image; with --grab one is taken, too.",
+        ),
     ] = None,
     plot: Annotated[
         Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")
@@ -157,9 +166,10 @@ def geometric(
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
-    check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
+    check_files([*(observed or []), dark, plan / "plan.csv"], [output, plot], file)
+    taken = dot_images(file, observed or [], plan, grab, exposure, feed, overwrite)
     calibration = calibrate_files(
-        file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
+        file, taken.images, plan / "plan.csv", dark or taken.dark, tracker_is_ideal=tracker_is_ideal
     )
     monitor = file.config.monitor
     written = write_calibrated(
@@ -174,16 +184,25 @@ def geometric(
 
 def psf(
     bench_file: BenchFile,
-    images: Annotated[
-        list[Path], Argument(metavar="IMAGES...", help="The tracker's images of the dots.")
-    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
     output: Annotated[
         Path,
         Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf."),
     ],
+    images: Annotated[
+        list[Path] | None,
+        Argument(metavar="IMAGES...", help="The tracker's images of the dots; none with --grab."),
+    ] = None,
+    grab: Grab = None,
+    exposure: Exposure = None,
+    feed: ShownTo = None,
+    overwrite: Overwrite = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="A dark frame, taken from each image; with --grab one is taken, too.",
+        ),
     ] = None,
     oversampling: Annotated[
         int, Option(metavar="N", help="Samples a tracker pixel along each axis.", min=2, max=16)
@@ -206,8 +225,11 @@ def psf(
     check_ending("-o", output, FITS)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
-    check_files([*images, dark, plan / "plan.csv"], [output, plot], file)
-    psf_result = effective_psf(file, images, plan / "plan.csv", dark, oversampling)
+    check_files([*(images or []), dark, plan / "plan.csv"], [output, plot], file)
+    taken = dot_images(file, images or [], plan, grab, exposure, feed, overwrite)
+    psf_result = effective_psf(
+        file, taken.images, plan / "plan.csv", dark or taken.dark, oversampling
+    )
     write_glass(output, psf_result.glass)
     if plot is not None:
         draw_effective(plot, psf_result)

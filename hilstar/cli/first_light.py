@@ -12,7 +12,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.image_source import image_source, virtual_truth
+from hilstar.cli.image_source import handed_on, image_source, virtual_truth
 from hilstar.cli.options import (
     BenchFile,
     Json,
@@ -23,7 +23,7 @@ from hilstar.cli.running import Console, ConsoleName, Control, Feed, Force, Toke
 from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern
+    from hilstar.instruments.calibrate.first_light.image_sources import Pattern
     from hilstar.server.bench import bench_file as files
     from hilstar.server.console.listener import PageListener
 
@@ -166,7 +166,7 @@ def first_light(
     with (
         page_listener(console, control, token, console_name) as listener,
         closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
-        _handed_on(feed, source),
+        handed_on(feed, source),
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -218,18 +218,3 @@ def _shown(
             feed.say(line)
 
         yield tell, feed.show
-
-
-@contextmanager
-def _handed_on(endpoint: str | None, source: "ImageSource") -> Iterator[None]:
-    """The session's patterns handed on at an endpoint, if there is one. Raises InputError."""
-    if endpoint is None:
-        yield
-        return
-    from hilstar.attitude.wire.shown_frames import FrameSender
-    from hilstar.instruments.calibrate.first_light.image_sources import PatternFrames
-
-    with FrameSender(endpoint) as sender:
-        source.hand_on(PatternFrames(sender))
-        say(f"frames: {sender.endpoint}")
-        yield

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.units import magnitude
-from hilstar.instruments.study.settings import held_out_by_type, held_out_errors
+from hilstar.instruments.study.study_benches import held_out_by_type, held_out_errors
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.sky.catalog import load_catalog

@@ -97,7 +97,7 @@ class Claim:
 @dataclass(frozen=True)
 class Table:
     """A table that `results/tables.py` makes of `file`, and what its kind of figures is held
-    against.
+    against. A name that ends in "*" stands for all others that begin so.
     """
 
     name: str
@@ -207,7 +207,8 @@ def page(root: Path = ROOT) -> str:
     lines += ["| table | file | oracle | shared with hilstar | test |", "|---|---|---|---|---|"]
     for table in tables_of(root):
         places = [name for name, text in pages.items() if f"<!-- table: {table.name} -->" in text]
-        of = f"{table.what} ({', '.join(link(place) for place in places)})"
+        linked = ", ".join(link(place) for place in places)
+        of = f"{table.what} ({linked})" if places else table.what
         cells = [of, f"`{table.file}`", oracle_of(table), table.shares, test_of(table.test)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

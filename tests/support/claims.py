@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 
@@ -124,12 +125,15 @@ def faults_of_tables(tables: list[Table], pages: dict[str, str], root: Path) -> 
     """
     shown = {name for text in pages.values() for name in TABLE.findall(text)}
     names = {table.name for table in tables}
-    found = [f"{ROWS}: no row of the table {name}" for name in sorted(shown - names)]
-    found += [f"{ROWS}: the table {name} is on no page" for name in sorted(names - shown)]
+    others = [name for name in names if name.endswith("*")]  # programs that are run on demand
+    unknown = {name for name in shown - names if not fnmatches(name, others)}
+    found = [f"{ROWS}: no row of the table {name}" for name in sorted(unknown)]
+    missing = names - shown - set(others)
+    found += [f"{ROWS}: the table {name} is on no page" for name in sorted(missing)]
     for table in tables:
         place = f"{ROWS}: table {table.name}: {table.test}"
         path, _, name = table.test.partition("::")
-        if not table.test and not table.is_outside():
+        if not table.test and (not table.is_outside() or table.name in others):
             continue
         if not (root / path).is_file() or name not in definitions(root / path):
             found.append(f"{place} does not exist")
@@ -141,6 +145,11 @@ def faults_of_tables(tables: list[Table], pages: dict[str, str], root: Path) -> 
         if table.is_outside() and not (table.against and table.names):
             found.append(f"{place}: nothing says what the test uses of the oracle")
     return found
+
+
+def fnmatches(name: str, patterns: list[str]) -> bool:
+    """Whether a name is one of those that the patterns stand for."""
+    return any(fnmatch(name, pattern) for pattern in patterns)
 
 
 def says(before: str, claim: Claim) -> bool:

@@ -51,6 +51,11 @@ def test_times_are_those_of_the_results():
     holds("frame-1000-h100", float(card["median_ms"]))
     fewest = min(times("scale", axis="packets"), key=lambda row: float(row["at"]))
     holds("frames-share", float(fewest["time"]))
+    for workers in ("1", "2"):
+        (row,) = times("scale", axis="workers", at=workers)
+        holds(f"case-by-{workers}", float(row["time"]))
+    (row,) = times("scale", axis="stars", at="1000000")
+    holds("memory-of-a-million", float(row["memory_mb"]))
 
 
 def test_settings_are_those_of_the_code():

@@ -156,7 +156,7 @@ def says(before: str, claim: Claim) -> bool:
     """Whether a text ends in a claim's figure, with its unit or without."""
     value = re.escape(claim.value)
     unit = re.escape(claim.unit)
-    return re.search(rf"(?<![\w.-]){value}(?: {unit})?$", before) is not None
+    return re.search(rf"(?<![\w.-]){value}(?: {unit})?\**$", before) is not None
 
 
 def unmarked_figures(pages: dict[str, str]) -> list[str]:

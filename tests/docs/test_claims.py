@@ -11,14 +11,23 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.display.window.output_settings import PITCH_TOLERANCE
+from hilstar.instruments.compare import sky_comparison
+from hilstar.instruments.confront.report import MAX_RMS_MAG, MAX_RMS_PX
 from hilstar.instruments.simulate.star_finder import MATCH_PX
 from hilstar.instruments.study.predictors import JITTER
 from hilstar.instruments.study.sweep import BUSY_SHARE
+from hilstar.optics.layers.bodies import HIDDEN
+from hilstar.optics.layers.view import POINT_PX
+from hilstar.optics.psf import MAX_NEGATIVE
+from hilstar.server.bench.config.hardware import Verify
 from hilstar.server.bench.config.render import (
     DEFAULT_TOLERANCE_MAG,
     DEFAULT_TOLERANCE_PX,
     RenderSettings,
 )
+from hilstar.server.bench.frame_files import MAX_SIP_PX
+from hilstar.server.summary import MAX_LATE_SHARE
 from tests.support import claims as support
 from tests.support.benches import ROOT
 from tests.support.claims import faults, holds, rows
@@ -60,11 +69,26 @@ def test_times_are_those_of_the_results():
 
 def test_settings_are_those_of_the_code():
     holds("shake", max(size_arcsec for size_arcsec, _ in JITTER))
-    holds("lost-star", MATCH_PX)
+    for claim in ("lost-star", "match-px"):
+        holds(claim, MATCH_PX)
     holds("busy-share", 100 * BUSY_SHARE)
     holds("tolerance-mag", DEFAULT_TOLERANCE_MAG)
     holds("tolerance-px", DEFAULT_TOLERANCE_PX)
     holds("sprite-sigma", max(RenderSettings().sprite_sigma_px))
+    verify = Verify()
+    holds("verify-mag", verify.flux_mag)
+    holds("verify-px", verify.centroid_px)
+    holds("verify-lost", 100 * verify.lost_share)
+    holds("compare-mag", sky_comparison.FLUX_MAG)
+    holds("compare-px", sky_comparison.CENTROID_PX)
+    holds("confront-px", MAX_RMS_PX)
+    holds("confront-mag", MAX_RMS_MAG)
+    holds("disc-px", POINT_PX)
+    holds("hidden-share", 100 * HIDDEN)
+    holds("negative-share", 100 * MAX_NEGATIVE)
+    holds("sip-limit", MAX_SIP_PX)
+    holds("pitch-share", 100 * PITCH_TOLERANCE)
+    holds("late-share", 100 * MAX_LATE_SHARE)
 
 
 @pytest.fixture(scope="module")

@@ -212,7 +212,8 @@ class Colours:
         away = self.mean_nm - self.mean_nm.mean()
         gram = self._gram + MEAN_WEIGHT * np.outer(away, away)
         near = wanted[:, 1:MOVED] + MEAN_WEIGHT * (wanted[:, :1] - self.mean_nm.mean()) * away
-        if (lens := self.lateral) is not None:
+        lens = self.lateral
+        if lens is not None:
             gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
             near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
         mixtures = nearest_mixtures(gram, near, whole=True)
@@ -253,7 +254,8 @@ class Colours:
 
         Before a lens of known lateral colour, px rms over the field.
         """
-        if (lens := self.lateral) is not None:
+        lens = self.lateral
+        if lens is not None:
             return np.asarray(
                 np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1)
             )
@@ -326,12 +328,11 @@ class Colours:
             return replace(sprites, primaries=light)
         # the same objects are the same light: it is moved once
         if not self._kept or self._kept[0] != sprites.extended:
-            by_primary_light = extended_by_share(sprites, stars, primaries, by_bv)
-            moved = zip(by_primary_light, self.places_px.tolist(), strict=True)
-            self._kept[:] = [
-                sprites.extended,
-                tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved),
-            ]
+            by_primary = extended_by_share(sprites, stars, primaries, by_bv)
+            moved = []
+            for lights, (x_px, y_px) in zip(by_primary, self.places_px.tolist(), strict=True):
+                moved.append(tuple(shifted(part, -x_px, -y_px) for part in lights))
+            self._kept[:] = [sprites.extended, tuple(moved)]
         return replace(sprites, primaries=light, lights=self._kept[1])
 
 

@@ -305,19 +305,19 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     """
     auto = render.quantisation == "auto"
     methods = _methods(render, light)
-    combinations = sorted(_combinations(render, light, methods), key=lambda one: one.ms)
-    best = [one for one in combinations if one.method == methods[-1]]
+    combinations = sorted(_combinations(render, light, methods), key=lambda choice: choice.ms)
+    most_accurate = [choice for choice in combinations if choice.method == methods[-1]]
     # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
-    if len(best) > 1:
+    if len(most_accurate) > 1:
         tested = combinations
     else:
-        tested = [one for one in combinations if one.method != methods[-1]]
+        tested = [choice for choice in combinations if choice.method != methods[-1]]
     stars = light.code_stars() if tested else None
-    for one in tested:
-        if stars is not None and _is_within(render, light, stars, one):
-            return Effort(render, light, one, by_cost=auto and one.method != CHEAP)
-    taken = next(one for one in best if _is_slight(render, one))
-    return Effort(render, light, taken, by_cost=auto)
+    for choice in tested:
+        if stars is not None and _is_within(render, light, stars, choice):
+            return Effort(render, light, choice, by_cost=auto and choice.method != CHEAP)
+    slight = next(choice for choice in most_accurate if _is_slight(render, choice))
+    return Effort(render, light, slight, by_cost=auto)
 
 
 def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:

@@ -74,10 +74,15 @@ def exposure_lights(
         lit = [_primaries_lit(levels, panel) for panel in panels]
         if len(exposed) == 1:
             return lit
-        total = total or [[np.zeros(size) for _ in primaries] for primaries in lit]
+        if not total:
+            total = [_dark_images(len(primaries), size) for primaries in lit]
         for whole, part in zip(itertools.chain(*total), itertools.chain(*lit), strict=True):
             whole.ravel()[part.place] += part.e_per_s
     return [_mean_lights(primaries, len(exposed)) for primaries in total]
+
+
+def _dark_images(count: int, shape: tuple[int, ...]) -> list[FloatArray]:
+    return [np.zeros(shape) for _ in range(count)]
 
 
 def _primaries_lit(levels: Levels, panel: Panel) -> list[LitLight]:

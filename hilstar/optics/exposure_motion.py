@@ -77,10 +77,11 @@ class Motion:
 def own_row_s(
     paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: Scan
 ) -> tuple[FloatArray, FloatArray]:
-    """When stars (k,) of some paths are at `seconds` (k,) of their own rows' exposures, and dt /
-    ds: how much longer that is.
+    """Times (k,) at which stars are `seconds` (k,) from the middle of their own rows' exposures,
+    and the rate (k,) at which these times grow with `seconds`.
 
-    Seconds count from the middle of the middle row's exposure.
+    Times count from the middle of the middle row's exposure. A star that moves along the scan stays
+    in lit rows longer: its rate is above 1.
     """
     size_px = paths.camera.resolution_px
     row_s = seconds

@@ -228,7 +228,9 @@ class Psf(ABC):
         return self
 
     def simpler(self) -> Iterator[tuple[str, Callable[[], "Psf"]]]:
-        """What makes PSFs that take less to draw, by name, the least first."""
+        """PSFs that are cheaper to draw, the cheapest first: the name of each, and a function that
+        makes it. None by default.
+        """
         yield from ()
 
     @property

@@ -138,7 +138,7 @@ class PixelGaussians:
         return np.asarray(np.einsum("nrwk,nwk->nrw", self._light, weight))
 
     def _moment(self, over_x: FloatArray, power: int) -> FloatArray:
-        """The same times y to a power, mean over each pixel's height: (n, h, w)."""
+        """The mean of y^power times the Gaussian over each pixel's height: (n, h, w)."""
         count, height, width = self._size
         rows = over_x.reshape(count, height, self._nodes, width)
         weight = self._weight[:, None] * self._y**power

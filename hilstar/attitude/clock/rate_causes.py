@@ -213,12 +213,12 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that
-    multiplies their noise by.
+    """A way in which rates may be wrong: `mends` (3, 3) turns them into right ones, and multiplies
+    their noise by `scale`.
 
-    They are taken to have ICRS components where `in_icrs`, else the camera's. `constant` (3,),
-    rad/s, is added to them all. Where they fit another `reading` of the quaternions, it is the sky
-    that is wrong.
+    Rates have ICRS components where `in_icrs`, else the camera's. `constant` (3,), rad/s, is added
+    to all of them, and `lag_s` is how late they are. Where they fit another `reading` of the
+    quaternions, the quaternions are read wrongly: the sky is wrong, not the rates.
     """
 
     text: str

@@ -83,7 +83,9 @@ def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) ->
 
 
 def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -> Cause | None:
-    """What the newest stretches of a length show, few of them first."""
+    """The cause that the newest stretches of a length show: the few newest are asked first, then
+    more; None where none shows one.
+    """
     for count in (MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES):
         newest = length.newest(count)
         if not newest:

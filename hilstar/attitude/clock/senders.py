@@ -122,7 +122,9 @@ class _Counter:
 
     @property
     def regular(self) -> bool:
-        """Whether it runs so evenly that what does not continue it is not its own."""
+        """Whether its counts come so evenly that a message that does not continue them is another
+        sender's.
+        """
         return self.heard >= REGULAR_AFTER and self.even_share >= REGULAR_SHARE
 
     def off_ns(self, arrival: SampleArrival) -> float | None:
@@ -231,7 +233,7 @@ class _Counter:
         self.taken[sample.sequence % RECENT] = _Taken(sample.sequence, sample.t_ns)
 
     def patience_ns(self, silent_after_ns: int) -> float:
-        """For how long it may be silent before another counter is its own, begun anew."""
+        """The silence after which another counter is taken for the same sender, started anew."""
         if self.heard < MIN_KNOWN or self.host_ns - self.since_ns < MIN_KNOWN_NS:
             return silent_after_ns
         return min(silent_after_ns, USUAL_SILENCES * self.silence_ns + SLACK_NS)
@@ -493,7 +495,9 @@ class Senders:
         return [arrival]
 
     def _all_own(self) -> list[SampleArrival]:
-        """What is held is of the sender shown, as it turns out."""
+        """The messages held back: they turned out to be of the sender shown. Their counters are no
+        longer others'.
+        """
         counters = {id(held.counter) for held in self._held}
         self._others = [other for other in self._others if id(other) not in counters]
         return self._released()
@@ -502,7 +506,7 @@ class Senders:
         return [held.arrival for held in self._emptied()]
 
     def _decided(self, main: _Counter) -> list[SampleArrival]:
-        """What is held, with a refusal but for those messages of this counter."""
+        """The messages held back, each with a refusal unless it is of this counter."""
         arrivals: list[SampleArrival] = []
         for held in self._emptied():
             if held.counter is main:

@@ -388,8 +388,8 @@ class Timeline:
         return rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
 
     def _damp(self, sample: AttitudeSample) -> _Damped:
-        """What a prediction takes from the rate of the next sample; nothing from one whose
-        acceleration is known.
+        """How far the rate of the next sample is damped before it is used to predict; not at all
+        where its acceleration is known.
         """
         damping = self._damping
         previous = self._samples[-1] if self._samples else None

@@ -82,8 +82,8 @@ def _is_same(one: ModuleSpec | None, other: ModuleSpec) -> bool:
 
 
 def _look_here_last(folder: str) -> None:
-    """What the module imports later is found beside it, but nothing there stands in the way of
-    what is installed.
+    """Put a folder last in the search path: the module there finds its neighbours, and nothing
+    there hides an installed package.
     """
     while folder in sys.path:
         sys.path.remove(folder)

@@ -432,14 +432,14 @@ class SkyComparison:
 
     @property
     def flux_error_mag(self) -> ErrorSpread:
-        """Of the stars that both images have."""
+        """The spread of the flux errors of stars that both images have."""
         return error_spread(
             np.array([abs(star.flux_error_mag) for star in self.of("same", "changed")])
         )
 
     @property
     def centroid_error_px(self) -> ErrorSpread:
-        """Of the stars that both images have."""
+        """The spread of the centroid errors of stars that both images have."""
         return error_spread(
             np.array([star.centroid_error_px for star in self.of("same", "changed")])
         )

@@ -207,9 +207,7 @@ def zero_point_mag(bench: Bench) -> float:
 
 
 def _like_the_sun(bench: Bench) -> IntArray:
-    """The stars of its colour, or else the nearest to it: where there are stars, none of these
-    is far from it.
-    """
+    """The stars within LIKE_SOLAR_BV of the Sun's B-V, or else those nearest to it."""
     distance = np.abs(bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)] - SOLAR_BV)
     return np.flatnonzero(distance <= max(LIKE_SOLAR_BV, float(distance.min())))
 

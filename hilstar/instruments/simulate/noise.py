@@ -92,8 +92,8 @@ Table = npt.NDArray[np.void]
 
 
 def in_mosaic(mosaic: FloatArray, bayer: str, shape: tuple[int, int]) -> FloatArray:
-    """What pixels (2, h, w) have of a star and of the mean pixel's background, by those of red,
-    green and blue (2, 3).
+    """The shares of a star and of the background that a mosaic's pixels (2, h, w) collect, relative
+    to the mean pixel, by the shares of red, green and blue (2, 3).
     """
     star, background = mosaic
     star_images = [np.full(shape, share) for share in star]
@@ -146,8 +146,8 @@ class NoisyStar:
         self._pairs = np.einsum("ifp,jfp->fpij", by, by).reshape(count, -1, 16)
 
     def _patterns(self) -> FloatArray:
-        """What pixels have of star and background (2, n, side, side) where a star is before each
-        of a mosaic's n pixels.
+        """The shares of star and background of the pixels in a window, (2, n, side, side), for a
+        star on each of the n pixels of a mosaic's pattern.
         """
         if self.mosaic is None or self.detector.bayer is None:
             return np.ones((2, 1, 1, 1))

@@ -366,7 +366,9 @@ def _share(of: Camera, within: Camera) -> float:
 
 
 class _Oddity(NamedTuple):
-    """What cannot be right, and by how many decades."""
+    """A length or ratio of a bench that cannot be right, in words, and by how many decades it is
+    off.
+    """
 
     text: str
     decades: float

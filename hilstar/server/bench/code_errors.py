@@ -209,8 +209,8 @@ def _grid(psf: Psf, seen: Seen, path_px: float, number: int) -> PhaseGrid:
 
 
 def _grid_of(psf: Psf, seen: Seen, path_px: float, phases: Phases) -> PhaseGrid:
-    """Stars at phases, on paths of a length: as `frame_motion` draws them, in sprites at the
-    nodes of each path.
+    """A grid of stars at phases, each on a path of `path_px`: drawn as `frame_motion` draws paths,
+    as sprites at Gauss-Legendre nodes.
     """
     sigmas = path_px / np.mean(psf.width_px)
     nodes = nodes_of(node_counts(np.array([sigmas]), NODES_PER_SIGMA, 1, POINT_SIGMA))

@@ -336,7 +336,9 @@ def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
 
 
 def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
-    """What codes cost where they are drawn, measured or by the file; None where neither says so."""
+    """The cost of choosing codes where they are drawn, as it was measured, or as `[render]
+    codes_ms` states it; None for neither.
+    """
     if light.measured is None and render.codes_ms is not None:
         return FieldCost(*render.codes_ms, "by [render] codes_ms")
     return light.measured
@@ -402,7 +404,9 @@ def _scale(render: RenderSettings, light: Light) -> float:
 
 
 def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> float:
-    """The time of a frame of an average field that is not its sprites' pixels and paths."""
+    """The time of an average field's frame, ms, less what its sprites' pixels and paths take: what
+    choosing the codes costs.
+    """
     scale = _scale(render, light)
     known = known_cost(render, light)
     whole_ms = light.cost(QUANTISERS[method], light.psf).a_star_ms * light.stars * scale
@@ -441,7 +445,7 @@ def code_part(effort: Effort) -> Choice:
 
 
 def _price(cost: FieldCost, light: Light) -> str:
-    """What `exact` takes of a refresh."""
+    """The time that `exact` takes of a refresh, in words."""
     best_ms, cheap_ms = (_two_digits(ms) for ms in (cost.best_ms, cost.cheap_ms))
     price_text = f"exact takes {best_ms} ms of {light.refresh_ms:.3g} (round {cheap_ms})"
     price_text += f" for an average field at 1 deg/s {cost.where}"

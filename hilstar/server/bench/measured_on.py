@@ -34,7 +34,9 @@ class MeasuredOn:
 
     @property
     def lacks(self) -> str:
-        """What it does not say; "" where it says both."""
+        """What the file does not say of its origin, in words; "" where it names both monitor and
+        date.
+        """
         if self.built_in:
             return f'[monitor] calibration = "{self.name}" is built in'
         lacking = []

@@ -67,11 +67,11 @@ class _Trial:
     changes: tuple[Change, ...] = ()
 
     def but(self, key: str, value: Value, **changed: Any) -> "_Trial":
-        """The same with one more change."""
+        """The trial with one more change."""
         return replace(self, changes=(*self.changes, Change(key, value)), **changed)
 
     def rendered(self, key: str, value: Value, **more: Value) -> "_Trial":
-        """The same with another value of a key of [render]."""
+        """The trial with another value of a key of [render]."""
         changed: dict[str, Value] = {key: value, **more}
         render = msgspec.structs.replace(self.render, **changed)
         return self.but(f"[render] {key}", value, render=render)
@@ -217,7 +217,7 @@ def would_do(bench: Bench) -> list[Remedy]:
 
 
 def _remedies(trials: _Trials, some: Sequence[_Trial | None]) -> list[Remedy]:
-    """What some trials come to, but those that there are none of."""
+    """The remedies of those trials that are not None, with the errors that each leaves."""
     remedies = []
     for trial in some:
         if trial is not None:

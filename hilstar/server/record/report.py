@@ -267,7 +267,7 @@ class FrameMarks:
 
 
 def _covered(wrong_sky: WrongSky, swap_ns: npt.NDArray[np.int64]) -> BoolArray:
-    """Which of these moments (n,) of host time had a wrong sky."""
+    """Whether there was a wrong sky at each of these host times (n,)."""
     covered = np.zeros(len(swap_ns), dtype=bool)
     if wrong_sky.any:
         for begin_ns, end_ns in wrong_sky.spans_ns():

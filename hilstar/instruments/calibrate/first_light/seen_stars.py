@@ -184,7 +184,7 @@ class StarSpot:
 
 
 class Beyond(NamedTuple):
-    """What residuals have beyond their noise: a standard deviation, and its bounds of 95 % below
+    """The scatter of residuals beyond their noise: a standard deviation, and its 95 % bounds below
     and above.
     """
 
@@ -194,8 +194,8 @@ class Beyond(NamedTuple):
 
     @classmethod
     def of(cls, residual: FloatArray, noise: FloatArray) -> "Beyond":
-        """Of residuals (n,) and the noise (n,) of each: the weighted mean of what their squares
-        have more.
+        """The scatter of residuals (n,) beyond their noise (n,): the square root of the weighted
+        mean of residual^2 - noise^2.
         """
         weight = 1 / (noise**2 + float(np.median(noise)) ** 2) ** 2
         more = float((weight * (residual**2 - noise**2)).sum() / weight.sum())
@@ -259,7 +259,7 @@ class StarsSeen:
 
     @property
     def beyond_px(self) -> Beyond:
-        """What places have beyond their noise, along one axis."""
+        """The scatter of the stars' places beyond their noise, along one axis, px."""
         return Beyond.of(self.residual_px.ravel(), np.repeat(self.place_noise_px, 2))
 
     def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> "Scatter":

@@ -34,6 +34,7 @@ MIN_PATH_SIGMA = 0.005
 # A longer turn is cut into pieces of this angle, so that each is short compared with the field and
 # has enough nodes.
 MAX_PIECE_RAD = 0.05
+# the longest piece that MAX_NODES can draw
 MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
 # An exposure's work is bounded: more pieces are refused, and more sprites are thinned out by nodes
 # farther apart.

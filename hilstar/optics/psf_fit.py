@@ -24,6 +24,7 @@ MAX_CORRELATION = 0.95
 FIT_ROUNDS = 8
 MAX_STEP_PX, MAX_STEP_SHARE = 0.3, 0.6  # of a place, and of a variance, in one round
 RIDGE = 1e-9  # on unit columns: two that are alike share the light
+# residuals of more than so many medians count less, anew in each round
 FIELD_ROUNDS, OUTLIER_MEDIANS = 5, 2.0
 SMALLEST = 1e-300
 XX, YY, XY = 0, 1, 2

@@ -39,7 +39,7 @@ MIN_RUN = 3  # messages: a counter, and no stray
 ESTABLISHED_AFTER = 8
 # other counters begun, and no fewer than the messages of the one shown: there is no counter
 MAX_BEGUN = 3
-REGULAR_AFTER = 16
+REGULAR_AFTER = 16  # messages, before it is known whether a counter runs evenly
 # share of steps that are as the one before: 0.5 where 3 of 10 packets are lost, 0.05 where 9 are
 REGULAR_SHARE, IRREGULAR_SHARE = 0.5, 0.25
 OTHER_LIFE_NS = 5 * NS_PER_S
@@ -54,7 +54,7 @@ MAX_STEP_NS = 10 * NS_PER_S  # between two messages, for their period
 MIN_KNOWN, MIN_KNOWN_NS = 8, NS_PER_S  # before a sender's usual silences are known
 USUAL_SILENCES, SLACK_NS = 3, 20 * NS_PER_MS
 FORGETS = 0.98  # decay of a silence with each message
-PERIOD_GAIN = EVEN_GAIN = 1 / 8
+PERIOD_GAIN = EVEN_GAIN = 1 / 8  # each message's weight in the running means
 
 # a number, or an address and port; None where a message shows neither
 Identity = int | tuple[Any, ...] | None

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Sure, Tiles
     from hilstar.display.render.extended import ExtendedLayer
 
-FIRST_CAPACITY = 4096
+FIRST_CAPACITY = 4096  # sprites; the buffer grows by doubling
 UNTIMED = nullcontext()
 
 

@@ -46,7 +46,7 @@ SPANS = 8192  # in which a run is drawn along its time
 BLOCK = 4096  # records that are added at once
 MEGABYTE = 1e6
 WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
-KEYFRAMES = 16
+KEYFRAMES = 16  # drawn in the report, evenly over the run
 MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
 SMALL_RAD = 1e-8
 # newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz

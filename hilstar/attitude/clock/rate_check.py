@@ -158,6 +158,7 @@ class _History:
         self._stretches.append(stretch)
         while stretch.to_ns - self._stretches[0].to_ns > HISTORY_S * NS_PER_S:
             self._stretches.popleft()
+        # not yet due; a time far ahead is that of a sender that has started anew since
         if self._next_ns is not None and 0 <= self._next_ns - stretch.to_ns <= LAG_EACH_NS:
             return None
         self._next_ns = stretch.to_ns + LAG_EACH_NS
@@ -227,8 +228,10 @@ class RateCheck:
         anew.
         """
         last_ns = self._last_ns
+        # a little earlier: overtaken, or sent twice
         if last_ns is not None and last_ns - RESTART_NS < sample.t_ns <= last_ns:
             return False
+        # much earlier is a sender that starts anew; across a gap nothing says how it turned
         if last_ns is not None and not 0 < sample.t_ns - last_ns <= MAX_GAP_NS:
             self._restart()
         self._last_ns = sample.t_ns

@@ -197,6 +197,7 @@ class _Counter:
         step = _steps(self.sequence, sample.sequence)
         if not -RECENT < step < 0 or sample.t_ns >= self.t_ns:
             return False
+        # older by more than twice what its count says: of another counter
         if sample.t_ns < self.t_ns + 2 * step * (self.period_ns or 0.0) - EARLY_NS:
             return False
         taken = self.taken.get(sample.sequence % RECENT)

@@ -399,6 +399,7 @@ class Timeline:
         if rate is None or sample.acceleration_cam_rad_s2 is not None:
             damping.restart()
             return UNDAMPED
+        # Across a gap or a jump the attitudes do not say how the camera turned.
         if (
             previous is None
             or sample.t_ns - previous.t_ns > self.policy.stale_after_ns

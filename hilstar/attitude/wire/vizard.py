@@ -168,6 +168,7 @@ class DifferenceRates:
         earlier_mean, earlier_s = earlier
         acceleration = (mean - earlier_mean) / ((step_s + earlier_s) / 2)
         rate = mean + acceleration * (step_s / 2)
+        # the means are slow enough, but carried on to the end of the step they are not
         if math.hypot(*rate) > self._max_rate_rad_s:
             return sample
         return replace(sample, rate_cam_rad_s=rate, acceleration_cam_rad_s2=acceleration)

@@ -253,6 +253,9 @@ def _whereabouts() -> str:
 
 
 def _say_if_read(line: str) -> None:
+    """Write a line to stderr where there is room in its pipe: one that nobody reads holds nothing
+    up.
+    """
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
             os.write(2, line.encode())

@@ -59,11 +59,11 @@ def _check_place(package: str, folder: str) -> None:
             f"no module {package} stands in {folder}; {ADVICE.format(package=package)}"
         )
     loaded = sys.modules.get(package)
+    # Python would give the package of that name again that it has loaded from another folder.
     if loaded is not None and package in _folders and _folders[package] != folder:
-        for module_name in [
-            module_name for module_name in sys.modules if module_name.partition(".")[0] == package
-        ]:
-            del sys.modules[module_name]
+        for module_name in list(sys.modules):
+            if module_name.partition(".")[0] == package:
+                del sys.modules[module_name]
         loaded = None
     is_foreign = package in sys.stdlib_module_names or (
         loaded is not None and not _is_same(loaded.__spec__, spec)

@@ -301,15 +301,18 @@ class _Search:
 
     def run(self) -> None:
         """Look for the worst star, and end at the first that is over the limit."""
+        # Steps are coarsest for faint stars: they are tried first, over a few spans of brightness.
         faintest_first = range(len(self._stars.spans) - 1, -1, -1)
         for span in faintest_first[::COARSE]:
             if self._is_over(span, span):
                 return
+        # then every span about the worst
         worst = self._corners()
         for span in faintest_first:
             near = min(abs(span - corner.span) for corner in worst) <= ABOUT
             if near and (self._is_over(span, span) or self._is_over(span, span + 1)):
                 return
+        # then phases ever nearer to the worst
         for radius_px, spans in zip(NEARER_PX, NEARER_SPANS, strict=True):
             for corner in self._corners():
                 if self._is_over_near(corner, radius_px, spans):

@@ -12,7 +12,7 @@ from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import BenchFile, Json
 from hilstar.cli.pointing import RadecText, StarText, optional_attitude
 from hilstar.cli.running import say_optics
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.server.bench import bench_file as benches
@@ -81,12 +81,13 @@ def budget(
         raise InputError(
             f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}"
         )
-    with load(bench_file) as bench:
+    with busy("finding the budget"), load(bench_file) as bench:
         fields = fields_of_view(bench.config, bench.file.folder)
         star_budget = find_budget(bench, by)
         assumed = shares_line(bench) or colour_line(bench)
     if output is not None:
-        write_report(make_directory(output), star_budget)
+        with busy("drawing the chart"):
+            write_report(make_directory(output), star_budget)
     print_found(as_json, star_budget, budget_lines(star_budget))
     say_optics(fields, star_budget.star)
     if assumed is not None:
@@ -118,9 +119,10 @@ def star_noise(
     attitude = optional_attitude("budget", radec, star, None, epoch_jyear)
     if sensor is not None:
         file = with_its_figures(file, sensor)
-    noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
-    if output is not None:
-        write_noise(make_directory(output), noise)
+    with busy("finding the noise"):
+        noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
+        if output is not None:
+            write_noise(make_directory(output), noise)
     answer = [] if sensor is None else [sensitivity_line(noise)]
     print_found(as_json, noise, [*answer, *noise_lines(noise)])
 

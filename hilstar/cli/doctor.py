@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from hilstar.cli.options import Json
 from hilstar.cli.running import say_units
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 OwnBench = Annotated[
     Path | None,
@@ -42,8 +42,9 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
         cells = row()
         print_found(as_json, cells, [table(cells)])
         return
-    benches = examine_bench(bench_file, datetime.now(UTC).date())
-    result = examine()
+    with busy("examining this machine"):
+        benches = examine_bench(bench_file, datetime.now(UTC).date())
+        result = examine()
     for bench in benches.values():
         say_units(bench.fields)  # a star that is too wide is on the page, with its panels
     if benches:

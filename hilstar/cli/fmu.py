@@ -15,7 +15,7 @@ from hilstar.attitude.wire import protocol
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import check_ending, temporary_folder, written
 from hilstar.cli.options import BenchFile, check_files
-from hilstar.server.console.terminal import say
+from hilstar.server.console.terminal import busy, say
 
 FMU = (".fmu",)
 # the modules in the FMU: the model, and the table of the wire that it imports
@@ -36,7 +36,7 @@ def fmu(
     file = read_bench_file(bench_file)
     check_files([], [output], file)
     address = _address(file.path, file.config.attitude)
-    with temporary_folder("fmu") as folder:
+    with busy("building the FMU"), temporary_folder("fmu") as folder:
         written(output, lambda out: out.write(build(folder, address).read_bytes()))
     say(f"{output}: sends to {address}; start hilstar serve {bench_file} there")
     typer.echo(str(output))

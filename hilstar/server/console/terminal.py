@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -30,6 +31,7 @@ INSTEAD: "dict[Reason, str]" = {
     "time": "let t_ns rise from packet to packet",
     "source": "stop one of the two senders",
 }
+BUSY_AFTER_S = 1.0  # a command that ends sooner shows no bar
 CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
 
 
@@ -202,9 +204,45 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
+    # What is printed meanwhile stays on stdout; redirected, it would come out on stderr.
+    with Progress(
+        *columns, console=console, transient=True, refresh_per_second=4, redirect_stdout=False
+    ) as bar:
         task = bar.add_task(what, total=None if math.isinf(total) else total)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def busy(what: str, after_s: float = BUSY_AFTER_S) -> Iterator[None]:
+    """The time that a computation of unknown length takes, on a terminal's stderr once it has
+    taken `after_s`; nothing elsewhere.
+    """
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield
+        return
+    ended = threading.Event()
+    shower = threading.Thread(target=_show_busy, args=(what, after_s, ended), daemon=True)
+    shower.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        shower.join()
+
+
+def _show_busy(what: str, after_s: float, ended: threading.Event) -> None:
+    if ended.wait(after_s):
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, refresh_per_second=4, redirect_stdout=False
+    ) as bar:
+        bar.add_task(what, total=None)
+        ended.wait()
 
 
 def fail(line: str, code: int) -> NoReturn:

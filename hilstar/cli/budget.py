@@ -9,6 +9,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_directory, make_directory
+from hilstar.cli.completion import centroiders, offered, sensor_names
 from hilstar.cli.options import BenchFile, Json
 from hilstar.cli.pointing import RadecText, StarText, optional_attitude
 from hilstar.cli.running import say_optics
@@ -28,6 +29,7 @@ def budget(
         str | None,
         Option(
             metavar="NAME",
+            autocompletion=offered(centroiders),
             help=(
                 "Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or"
                 " box5 (centres of mass), or "
@@ -49,6 +51,7 @@ def budget(
         Option(
             "--sensor",
             metavar="NAME",
+            autocompletion=offered(sensor_names),
             help="Whether this sensor (imx250, ...) behind the bench's lens is sensitive enough.",
         ),
     ] = None,

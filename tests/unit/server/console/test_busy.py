@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from hilstar.server.console.terminal import busy, progress
+from hilstar.server.console.terminal import busy, print_states, progress
 
 
 class Terminal(io.StringIO):
@@ -83,3 +83,36 @@ def test_results_stay_on_stdout(on_terminal, capsys, shown):
         print("the result")
     assert capsys.readouterr().out == "the result\n"
     assert "the result" not in terminal.getvalue()
+
+
+LINES = ["ok      python      3.11", "MISSING opengl      none", "        what mends it"]
+
+
+def test_states_have_colours_on_a_terminal(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stdout", stream)
+    print_states(LINES)
+    ok, missing, remedy = stream.getvalue().splitlines()
+    assert ok == "\x1b[32mok      \x1b[0m\x1b[1;36mpython\x1b[0m      3.11"
+    assert missing.startswith("\x1b[1;31mMISSING")
+    assert remedy == LINES[2]
+
+
+@pytest.mark.parametrize("colour", ["", "1"])
+def test_states_have_none_elsewhere(monkeypatch, colour):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("NO_COLOR", colour)
+    stream = Terminal() if colour else io.StringIO()
+    monkeypatch.setattr(sys, "stdout", stream)
+    print_states(LINES)
+    assert stream.getvalue().splitlines() == LINES
+
+
+def test_a_terminal_that_cannot_erase_gets_no_bar(on_terminal, monkeypatch):
+    terminal = on_terminal()
+    monkeypatch.setenv("TERM", "dumb")
+    with busy("computing", after_s=0.0), progress("sending", 3):
+        time.sleep(SOON_S)
+    assert terminal.getvalue() == ""

@@ -12,6 +12,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
+from hilstar.cli.completion import offered, steps
 from hilstar.cli.image_source import handed_on, image_source, virtual_truth
 from hilstar.cli.options import (
     BenchFile,
@@ -115,7 +116,12 @@ def first_light(
     ] = None,
     feed: Feed = None,
     again: Annotated[
-        list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")
+        list[str] | None,
+        Option(
+            metavar="STEP",
+            help="Do this step again; may be given often.",
+            autocompletion=offered(steps),
+        ),
     ] = None,
     seed: Annotated[int, seed_option("With --virtual: seed of the tracker's noise.")] = 0,
     force: Force = False,

@@ -137,12 +137,12 @@ def _counts(found: Assessment) -> Iterator[KeyFigure]:
     yield KeyFigure(_percent(found), f"{cycle}, one each {1e3 * lock.cycle_s:.4g} ms", state)
     yield _count(len(found.wrong), "wrong answers", BAD)
     yield _count(len(lock.lost), "lost locks", BAD)
-    missed = found.run.run.missed
+    run = found.run.run
     of = "missed frames"
-    if missed:
-        share = missed / (missed + len(found.run.commanded.t_s))
-        of = f"{of}, {100 * share:.2g} % of the refresh periods"
-    yield _count(missed, of, WARN)
+    if run.missed:
+        share = f"{100 * run.missed_share:.2g} % of the refresh periods"
+        of = f"{of}, {share}; {run.held} frames were held for them"
+    yield _count(run.missed, of, WARN)
 
 
 def _count(count: int, of: str, state: str) -> KeyFigure:

@@ -376,6 +376,9 @@ def _transfer(session: Session) -> str:
 
 
 def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -> str:
+    from matplotlib.colors import TwoSlopeNorm
+
+    about_one = TwoSlopeNorm(1.0, 0.5, 2.0)  # white where the noise explains the residuals
     chi2 = [verdict.background_chi2 for verdict in verdicts]
     columns = min(len(verdicts), 4)
     rows = math.ceil(len(verdicts) / columns)
@@ -388,7 +391,7 @@ def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -
         finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows
     ) as panels:
         for axes, verdict, views in zip(panels, verdicts, pictures, strict=False):
-            drawn = axes.imshow(views.chi2_map, vmin=0.5, vmax=2.0, cmap="RdBu_r", aspect="auto")
+            drawn = axes.imshow(views.chi2_map, norm=about_one, cmap="RdBu_r", aspect="auto")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.grid(visible=False)

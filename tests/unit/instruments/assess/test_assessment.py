@@ -489,9 +489,10 @@ def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path)
     assert said is not None and 30 <= int(said[1]) <= 37 and int(said[2]) > 0
     page = (tmp_path / "out" / "budget.html").read_text()
     assert line.split(None, 2)[2] in page
-    assert re.search(
-        r">\d+<small>missed frames, [0-9.]+ % of the refresh periods; \d+ frames were", page
+    tile = re.search(
+        r">(\d+)<small>missed frames, [0-9.]+ % of the refresh periods; (\d+) frames were", page
     )
+    assert tile is not None and tile[1] == said[1] and 0 < int(tile[2]) <= int(said[1])
     assert (
         f"answers left out for held frames,,{said[2]},"
         in (tmp_path / "out" / "budget.csv").read_text()

@@ -294,7 +294,7 @@ class Assessment:
         hold_s = self.run.commanded.hold_s
         if not missed:
             return "none"
-        share = 100 * missed / (missed + len(self.run.commanded.t_s))
+        share = 100 * self.run.run.missed_share
         longest = int(np.argmax(hold_s)) if len(hold_s) else -1
         if longest >= 0:
             where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"

@@ -61,8 +61,8 @@ MEASURANDS = {
     "star_flux": (
         "flux, with what the codes lose, and the errors of the catalogue and of the spectrum, mag"
     ),
-    "star_place_along": "place_along, with the catalogue's error, arcsec",
-    "star_place_across": "place_across, with the catalogue's error, arcsec",
+    "star_place_along": "the same as along x, with the catalogue's error, arcsec",
+    "star_place_across": "the same as along y, with the catalogue's error, arcsec",
 }
 UNKNOWN = {
     "latency": ("latency",),

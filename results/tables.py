@@ -496,7 +496,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry")
+BESIDE = ("galsim", "astrometry", "lost")
 
 
 def beside_table(name: str) -> str:

@@ -81,7 +81,7 @@ def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> N
     with (folder / "out" / "ledger.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == told["cases"]
-    assert {row["level"] for row in rows if row["set"] == "rate"} >= {"0.1", "10"}
+    assert {row["level"] for row in rows if row["set"] == "rate"} >= {"0.1", "10.0"}
     with (folder / "out" / "acceptance.csv").open() as file:
         rates = [row for row in csv.DictReader(file) if row["quantity"] == "edge"]
     assert float(rates[0]["low"]) <= 1.0 <= float(rates[0]["high"]) and rates[0]["unit"] == "deg/s"

@@ -36,7 +36,7 @@ GROUPS = {
     "calibrate": (
         "Calibrate",
         CALIBRATE,
-        ("dots", "geometric", "psf", "alignment", "plan", "photometric", "scale"),
+        ("dots", "geometric", "psf", "alignment", "reference", "plan", "photometric", "scale"),
     ),
     "sensor": ("Calibrate", SENSOR, ("import_", "measure")),
     "optics": ("Calibrate", OPTICS, ("map_", "lens", "zernike")),

@@ -253,6 +253,8 @@ def _beside(found: Assessment) -> Iterator[Card]:
     if found.glass is not None:
         rows.append(("glass", found.glass.line()))
     yield Card("What is not the tracker's", words=[table_of(rows)])
+    if found.cube is not None:
+        yield Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)])
 
 
 def _slices(found: Assessment) -> Iterator[Card]:

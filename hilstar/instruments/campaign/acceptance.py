@@ -6,6 +6,7 @@ that: campaigns that go on where they were. So the same command goes on where an
 a plan with other limits judges it again.
 """
 
+import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -29,8 +30,9 @@ from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.store import Directory, failures
 from hilstar.instruments.campaign.sweep import LevelCount, counted, edge_figure, next_level
+from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from hilstar.server.bench.certificate import Certificate, bench_certificate
+from hilstar.server.bench.certificate import Certificate, CubeToBoresight, bench_certificate
 
 NOT_TESTED = "not tested"
 PLAN_FILE, LEDGER = "plan.toml", "ledger.csv"
@@ -245,6 +247,11 @@ class Acceptance:
             return None, 0.0
         late_ms = self.certificate.expanded(("latency",)) or 0.0
         return self.certificate.attitude_arcsec, late_ms / 1e3
+
+    @functools.cached_property
+    def cube(self) -> CubeToBoresight | None:
+        """From the reference to the tracker's boresight; None without [alignment]."""
+        return cube_to_boresight(self.file, self.certificate)
 
 
 def _unit(clause: ClauseTable, case_set: CaseSet) -> str:

@@ -119,6 +119,7 @@ def summary_of(acceptance: Acceptance, verdicts: list[ClauseVerdict], rows: int)
         "cases": rows,
         "bench_off_arcsec": own,
         "bench_off_s": seconds,
+        "cube_to_boresight": acceptance.cube,
         "clauses": [_clause(verdict) for verdict in verdicts],
         "untested": [
             {"capability": each.capability, "why": each.why} for each in acceptance.plan.untested
@@ -347,6 +348,9 @@ def _about(acceptance: Acceptance, results: list[SetResult], rows: int) -> Card:
         about.append(("certificate", f"{found.line}; {off_by(found)}"))
     elif acceptance.on_bench:
         about.append(("certificate", "none: the bench's own uncertainty is not taken off"))
+    cube = acceptance.cube
+    if cube is not None:
+        about.append(("cube to boresight", cube.line))
     sets = []
     for result in results:
         cases = sum(count.cases for count in result.levels)

@@ -568,3 +568,62 @@ def scale(
             f"flux_at_white_dof = {len(found.ratios) - 1}",
         ]
     print_found(as_json, summary, lines)
+
+
+def reference(
+    readings: Annotated[
+        Path,
+        Argument(
+            metavar="READINGS.csv",
+            help=(
+                "target,azimuth_deg,elevation_deg[,station][,sigma_arcsec][,x_px,y_px]: faces of"
+                " the cube (+x, -y, ...), lit dots (dot), and links between stations (docs:"
+                " Calibration files)."
+            ),
+        ),
+    ],
+    bench_file: Annotated[
+        Path | None,
+        Option("--bench", metavar="BENCH.toml", help="The bench, for dots by their pixels."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        Option("-o", "--output", metavar="FILE.toml", help="Write the table [alignment] here."),
+    ] = None,
+    name: Annotated[str, Option(metavar="TEXT", help="What the reference is.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Find how the display stands to the tracker's cube from a theodolite's readings: the table
+    [alignment] of the bench file.
+    """
+    import datetime
+
+    from hilstar.basics.files import write_whole
+    from hilstar.instruments.calibrate.reference import (
+        fit_reference,
+        lines_of,
+        read_readings,
+        summary_of,
+        toml_of,
+    )
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.cameras import bench_camera
+
+    check_ending("-o", output, TOML)
+    camera = None
+    file = None
+    if bench_file is not None:
+        file = read_bench_file(bench_file)
+        camera = bench_camera(file.config, file.folder)
+    check_files([readings, bench_file], [output], file)
+    found = fit_reference(readings, read_readings(readings, camera))
+    table = toml_of(found, name, datetime.datetime.now(datetime.UTC).date().isoformat())
+    written = []
+    if output is not None:
+        write_whole(output, table)
+        written.append(str(output))
+    print_found(
+        as_json,
+        summary_of(found) | {"written": written},
+        [*lines_of(found), "in the bench file:", *table.splitlines()],
+    )

@@ -12,7 +12,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.completion import offered, steps
+from hilstar.cli.completion import offered
 from hilstar.cli.image_source import handed_on, image_source, virtual_truth
 from hilstar.cli.options import (
     BenchFile,
@@ -32,6 +32,13 @@ PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
 MAX_AVERAGE = 1000  # images that verify averages
 
 
+def steps() -> Iterable[str]:
+    """The steps that --again takes."""
+    from hilstar.instruments.calibrate.first_light.session import NAMES
+
+    return NAMES
+
+
 def first_light(
     bench_file: BenchFile,
     output: Annotated[
@@ -40,7 +47,7 @@ def first_light(
             "-o",
             "--output",
             metavar="SESSION",
-            help="Directory of the session; an older one is gone on with.",
+            help="Directory of the session; an existing session is resumed.",
         ),
     ],
     grab: Annotated[

@@ -1,6 +1,6 @@
 """hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path

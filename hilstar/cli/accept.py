@@ -54,7 +54,9 @@ def accept(
     ] = None,
     workers: Annotated[
         int | None,
-        Option(help="Processes on this machine; by default one a core.", min=1, max=1024),
+        Option(
+            metavar="N", help="Processes on this machine; by default one a core.", min=1, max=1024
+        ),
     ] = None,
     solver: Annotated[
         str,

@@ -29,7 +29,7 @@ from hilstar.attitude.wire.keys import (
     load_public,
     load_secret,
 )
-from hilstar.attitude.wire.links import CLIENT_REJECTED, PAUSE_S, WRONG_PEER, Link, LinkCounts
+from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, LinkCounts, RawMessage
 from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -39,6 +39,9 @@ from hilstar.basics.units import NS_PER_MS
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
+CLIENT_REJECTED = "client-rejected"  # the notice that a connection to a socket that binds was none
+WRONG_PEER = "link-rejected"  # the notice that something else than a sender is at the other side
+MAX_TAKEN_BYTES = 8_000_000  # in one go
 MAX_GROWTH_BYTES = 256_000_000
 LOOK_S = 0.01
 FREED_WITHIN_S = 2.0
@@ -330,7 +333,7 @@ class SocketOptions(TypedDict, total=False):
     clock: HostClock
 
 
-class ZmqSocket(Link):
+class ZmqSocket(ByteRoad):
     """A socket and its context, bound or connected; reopened after a flood.
 
     A socket that binds is opened at once, to check that it can be. One that receives a stream is
@@ -339,15 +342,17 @@ class ZmqSocket(Link):
     would leave its sender waiting for ever.
     """
 
+    messages = True
+
     def __init__(self, kind: int, endpoint: str, **options: Unpack[SocketOptions]) -> None:
-        super().__init__(options.get("notices"), options.get("clock", HOST_CLOCK))
+        clock = options.get("clock", HOST_CLOCK)
+        super().__init__(endpoint, ATTITUDES, options.get("notices"), clock)
         self._max_part_bytes = options.get("max_part_bytes", MAX_PART_BYTES)
         bind = options.get("bind", False)
         keys = options.get("keys", NO_KEYS)
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
-        self.endpoint = endpoint
         self.verb = "bound to" if bind else "connected to"
         self._kind, self._bind, self._address = kind, bind, self._place.address
         self._keys = keys
@@ -445,6 +450,40 @@ class ZmqSocket(Link):
             return self._open()
         return self._socket
 
+    @property
+    def reconnects(self) -> int:
+        """See `ByteRoad.reconnects`: none where any number of senders connect to us."""
+        return reconnects_of(self.link_counts, bound=self._bind)
+
+    @property
+    def bound(self) -> bool:
+        """Whether others connect to it."""
+        return self._bind
+
+    @property
+    def trouble(self) -> str:
+        """See `ByteRoad.trouble`: what is there in the place of a partner."""
+        return trouble_of(self.link_counts, self._notices)
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The waiting messages, oldest first; see `ByteRoad.taken`."""
+        if not self._waits(timeout_ms):
+            return []
+        waiting: list[RawMessage] = []
+        taken_bytes = 0
+        while (
+            len(waiting) < QUEUE_MESSAGES
+            and taken_bytes < MAX_TAKEN_BYTES
+            and (parts := self._take_parts()) is not None
+        ):
+            waiting.append(RawMessage(self._clock.now_ns(), parts))
+            taken_bytes += sum(map(len, parts))
+        return waiting
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once a message waits."""
+        return self._waits(timeout_ms)
+
     def _waits(self, timeout_ms: float) -> bool:
         """True once a message waits; connections and memory are checked meanwhile."""
         deadline = self._clock.within(timeout_ms / 1000)
@@ -502,6 +541,13 @@ class ZmqSocket(Link):
         self._reset(f"a message of more than {passed_over or MAX_PARTS} parts")
         return None
 
+    def _put(self, parts: list[bytes]) -> bool:
+        """Send one message, never waiting; False where no peer takes it."""
+        with contextlib.suppress(zmq.Again):
+            self._ready().send_multipart(parts, zmq.NOBLOCK)
+            return True
+        return False
+
     def _reset(self, why: str) -> None:
         """Drop every connection, and what libzmq keeps of it."""
         self.link_counts.resets += 1
@@ -526,6 +572,55 @@ class ZmqSocket(Link):
             self._authenticator.stop()
         self._context.term()
         self._memory.close()
+
+
+class ZmqReply(ZmqSocket):
+    """A REP socket: each request gets one reply before the next can arrive; it binds, or connects
+    with `bind=False`.
+    """
+
+    def __init__(self, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+        options.setdefault("bind", True)
+        super().__init__(zmq.REP, endpoint, **options)
+
+    def request(self, timeout_ms: int) -> RawMessage | None:
+        """The next request, or None; waits at most `timeout_ms`.
+
+        libzmq announces a request without its delimiter, then drops it: none is waited for.
+        """
+        parts = self._take_parts() if self._waits(timeout_ms) else None
+        return None if parts is None else RawMessage(self._clock.now_ns(), parts)
+
+    def put(self, data: bytes, patience_s: float = 0.0) -> bool:
+        """Reply; a peer that is gone, or does not read, gets none."""
+        return self._put([data])
+
+    def put_parts(self, parts: list[bytes]) -> bool:
+        """Reply with a message of several parts."""
+        return self._put(parts)
+
+
+def reconnects_of(counts: LinkCounts, *, bound: bool) -> int:
+    """How often the other side of a socket came back: never where any number of senders connect to
+    it.
+    """
+    if bound:
+        return 0
+    return max(0, counts.connections - 1)
+
+
+def trouble_of(counts: LinkCounts, notices: Notices) -> str:
+    """Why a socket of these counts gives no messages, as far as its notices say; "" where they do
+    not.
+    """
+    wrong_peer = notices.latest(WRONG_PEER)
+    if wrong_peer:
+        return "" if counts.connections else wrong_peer
+    # who binds counts connections from their begin on, so also those that it then rejects
+    is_alone = counts.connections <= counts.rejected
+    if is_alone:
+        return notices.latest(CLIENT_REJECTED)
+    return ""
 
 
 def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:

@@ -16,8 +16,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.wire.endpoint import AllowedSenders
-from hilstar.attitude.wire.links import LinkCounts
 from hilstar.attitude.wire.nasa42 import MessageReader, MessageSplitter, Nasa42Link, Nasa42Lockstep
+from hilstar.attitude.wire.roads import LinkCounts
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import angle_between_rad, propagate

@@ -8,6 +8,7 @@ import contextlib
 import os
 import time
 import tty
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -16,10 +17,7 @@ from hilstar.attitude.wire.links import (
     MAX_BURST,
     MAX_PACKETS_PER_S,
     OVER_NS,
-    PAUSE_S,
     FloodGate,
-    LinkCounts,
-    RawMessage,
 )
 from hilstar.attitude.wire.packet import (
     AttitudeSample,
@@ -29,7 +27,8 @@ from hilstar.attitude.wire.packet import (
     encode,
     framed,
 )
-from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.roads import PAUSE_S, LinkCounts, RawMessage
+from hilstar.attitude.wire.serial_link import SerialLink, SerialRoad
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_S
@@ -69,8 +68,21 @@ def flooded_messages(jumped: set[int]) -> list[AttitudeSample]:
     return [replace(sample(7), sequence=k, discontinuity=k in jumped) for k in range(3 * MAX_BURST)]
 
 
+class ReadLine(SerialRoad):
+    """A port whose bytes were read a frame at a time, all of them before anybody looked."""
+
+    chunks: Sequence[RawMessage] = ()
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        chunks = list(self.chunks)
+        self.chunks = ()
+        return chunks
+
+
 class Line(SerialLink):
     """A line on which every frame was read by itself, all of them before anybody looked."""
+
+    road_kind = ReadLine
 
     def __init__(self, samples: list[AttitudeSample], damaged: set[int] = frozenset()) -> None:
         self.clock = FakeClock()
@@ -78,12 +90,8 @@ class Line(SerialLink):
         frames = [framed(encode(each)) for each in samples]
         for k in damaged:
             frames[k] = frames[k][:20] + bytes([frames[k][20] % 255 + 1]) + frames[k][21:]
-        self._chunks = [RawMessage(k, [data], k) for k, data in enumerate([b"\0", *frames])]
         super().__init__(os.ttyname(self._slave), 921_600, clock=self.clock)
-
-    def _read(self, device, timeout_ms: int) -> list[RawMessage]:
-        chunks, self._chunks = self._chunks, []
-        return chunks
+        self._road.chunks = [RawMessage(k, [data], k) for k, data in enumerate([b"\0", *frames])]
 
     def close(self) -> None:
         super().close()

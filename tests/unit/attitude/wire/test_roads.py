@@ -8,22 +8,17 @@ import contextlib
 import os
 import socket
 from collections.abc import Iterator
-from ipaddress import ip_address
 from pathlib import Path
 
 import pytest
 
-from hilstar.attitude.wire.byte_links import (
-    ACCEPT_EACH_S,
-    HELD_S,
-    TOLD_S,
-    FileBytes,
-    TcpBytes,
-    refuse_no_file,
-)
-from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
+from hilstar.attitude.wire.endpoint import AllowedSenders
+from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
+from hilstar.attitude.wire.roads import ANSWERS, ByteRoad
+from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
+from hilstar.server.answers.reader import HELD_S
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
 
@@ -33,25 +28,29 @@ SOON_MS = 20
 @contextlib.contextmanager
 def listening(
     clock: FakeClock, notices: Notices, allow: tuple[str, ...] = ()
-) -> Iterator[tuple[TcpBytes, int]]:
-    with socket.socket() as made:
-        made.bind(("127.0.0.1", 0))
-        port = made.getsockname()[1]
-    place = UdpPlace(ip_address("127.0.0.1"), port)
-    with TcpBytes(place, AllowedSenders(allow), notices, clock) as link:
-        yield link, port
+) -> Iterator[tuple[TcpRoad, int]]:
+    with TcpRoad(
+        ("127.0.0.1", 0),
+        AllowedSenders(allow),
+        ANSWERS,
+        notices,
+        clock,
+        listening=True,
+        held_s=HELD_S,
+    ) as link:
+        yield link, int(link.endpoint.rpartition(":")[2])
 
 
 def connect(port: int) -> socket.socket:
     return socket.create_connection(("127.0.0.1", port), 5)
 
 
-def taken(link: TcpBytes | FileBytes) -> bytes:
+def taken(link: ByteRoad) -> bytes:
     """What has come within a look."""
     return b"".join(chunk.parts[-1] for chunk in link.taken(SOON_MS))
 
 
-def closed(link: TcpBytes, made: socket.socket) -> bool:
+def closed(link: TcpRoad, made: socket.socket) -> bool:
     """Whether the link has closed a connection, which it may do at its next look."""
     link.taken(SOON_MS)
     made.settimeout(0.05)
@@ -63,7 +62,7 @@ def closed(link: TcpBytes, made: socket.socket) -> bool:
         return True
 
 
-def hold(link: TcpBytes, port: int, clock: FakeClock) -> socket.socket:
+def hold(link: TcpRoad, port: int, clock: FakeClock) -> socket.socket:
     """A connection that is accepted and has sent."""
     made = connect(port)
     made.sendall(b"a")
@@ -89,7 +88,7 @@ def test_a_link_without_a_tracker_rests_after_a_stranger_that_it_refused():
 def test_a_second_connection_is_refused_and_named_while_the_first_sends():
     clock, notices = FakeClock(), Notices()
     with listening(clock, notices) as (link, port), hold(link, port, clock) as first:
-        assert link.trouble() == ""
+        assert link.trouble == ""
         for _ in range(5):
             second = connect(port)
             own = second.getsockname()[1]
@@ -97,16 +96,16 @@ def test_a_second_connection_is_refused_and_named_while_the_first_sends():
             wait_for(lambda second=second: closed(link, second), "the refusal")
             second.close()
             assert (
-                f"from 127.0.0.1:{own}" in link.trouble()
-                and f":{first.getsockname()[1]} holds the line" in link.trouble()
+                f"from 127.0.0.1:{own}" in link.trouble
+                and f":{first.getsockname()[1]} holds the line" in link.trouble
             )
             clock.work(0.9e9 * HELD_S)
             first.sendall(b"b")
             wait_for(lambda: taken(link) == b"b", "the first one's bytes")
         assert notices.counts() == {"second-connection": 5}
-        assert (link.link_counts.rejected, link.link_counts.connections) == (5, 1)
+        assert (link.link_counts.refused, link.link_counts.connections) == (5, 1)
         clock.work(1e9 * TOLD_S)
-        assert link.trouble() == ""
+        assert link.trouble == ""
 
 
 def test_a_tracker_behind_a_half_open_line_is_back_after_three_seconds_and_not_before():
@@ -120,7 +119,7 @@ def test_a_tracker_behind_a_half_open_line_is_back_after_three_seconds_and_not_b
             again.sendall(b"c")
             wait_for(lambda: taken(link) == b"c", "the tracker's bytes")
             assert closed(link, half_open)
-            assert link.trouble() == ""
+            assert link.trouble == ""
     assert notices.counts() == {"second-connection": 1, "answers-lost": 1, "answers-back": 1}
 
 
@@ -164,13 +163,13 @@ def replaced(path: Path, kind: str) -> None:
 def test_a_file_that_becomes_something_else_is_let_go_told_once_and_taken_again(tmp_path, kind):
     path, notices, clock = tmp_path / "t.bin", Notices(), FakeClock()
     path.touch()
-    with FileBytes(path, notices, clock) as link:
+    with FileRoad(path, ANSWERS, notices, clock) as link:
         path.write_bytes(b"one")
         assert taken(link) == b"one"
         replaced(path, kind)
         for _ in range(3):
             assert taken(link) == b""
-        assert link.trouble() == f"it is {kind} now, and no regular file"
+        assert link.trouble == f"it is {kind} now, and no regular file"
         assert notices.counts() == {"answers-lost": 1}
         if kind == "a directory":
             path.rmdir()
@@ -178,7 +177,7 @@ def test_a_file_that_becomes_something_else_is_let_go_told_once_and_taken_again(
             path.unlink()
         path.write_bytes(b"two")
         assert taken(link) == b"two"
-        assert link.trouble() == ""
+        assert link.trouble == ""
         assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
 
 
@@ -188,38 +187,38 @@ def test_a_path_that_names_no_regular_file_at_the_start_is_refused(tmp_path, kin
     with pytest.raises(InputError, match=f"path = .*t.bin: {kind}; write the file"):
         refuse_no_file(tmp_path / "t.bin")
     # A reader that is started again in a run waits for the file instead.
-    with FileBytes(tmp_path / "t.bin", Notices(), FakeClock()) as link:
-        assert taken(link) == b"" and kind in link.trouble()
+    with FileRoad(tmp_path / "t.bin", ANSWERS, Notices(), FakeClock()) as link:
+        assert taken(link) == b"" and kind in link.trouble
 
 
 @pytest.mark.parametrize("then", ["gone", "a link to itself", "a link to nothing"])
 def test_a_file_that_cannot_be_read_any_more_is_told_while_that_lasts(tmp_path, then):
     path, notices = tmp_path / "t.bin", Notices()
     path.touch()
-    with FileBytes(path, notices, FakeClock()) as link:
-        assert taken(link) == b"" and link.trouble() == ""
+    with FileRoad(path, ANSWERS, notices, FakeClock()) as link:
+        assert taken(link) == b"" and link.trouble == ""
         path.unlink()
         if then != "gone":
             path.symlink_to(path if then == "a link to itself" else tmp_path / "nothing")
-        assert taken(link) == b"" and f"{path} cannot be read (" in link.trouble()
+        assert taken(link) == b"" and f"{path} cannot be read (" in link.trouble
         path.unlink(missing_ok=True)
         path.write_bytes(b"two")
-        assert taken(link) == b"two" and link.trouble() == ""
+        assert taken(link) == b"two" and link.trouble == ""
 
 
 def test_a_file_that_comes_back_is_no_trouble_any_more(tmp_path):
     path, aside = tmp_path / "t.bin", tmp_path / "aside.bin"
     path.touch()
-    with FileBytes(path, Notices(), FakeClock()) as link:
+    with FileRoad(path, ANSWERS, Notices(), FakeClock()) as link:
         path.rename(aside)
-        assert taken(link) == b"" and link.trouble()
+        assert taken(link) == b"" and link.trouble
         aside.rename(path)
-        assert taken(link) == b"" and link.trouble() == ""
+        assert taken(link) == b"" and link.trouble == ""
 
 
 def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path):
     path, notices = tmp_path / "t.bin", Notices()
-    with FileBytes(path, notices, FakeClock()) as link:
-        assert taken(link) == b"" and "cannot be read (No such file" in link.trouble()
+    with FileRoad(path, ANSWERS, notices, FakeClock()) as link:
+        assert taken(link) == b"" and "cannot be read (No such file" in link.trouble
         path.symlink_to("/dev/zero")
-        assert taken(link) == b"" and "a device" in link.trouble()
+        assert taken(link) == b"" and "a device" in link.trouble

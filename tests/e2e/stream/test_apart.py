@@ -26,7 +26,7 @@ from hilstar.attitude.wire.apart import ReaderProcess, Record, RecordStream, pac
 from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link
-from hilstar.attitude.wire.packet import AttitudeSample, TimeRequest, decode
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.roads import LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialApart
 from hilstar.attitude.wire.source import Mounting
@@ -40,7 +40,6 @@ from tests.support.forks import Started
 from tests.support.senders import connected, free_port, packet, publisher
 from tests.support.sources.nasa42 import message
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
-from tests.support.wire.ptys import Cable
 
 HOLD_S = 0.5
 # A stamp that waits for the lock is late by the rest of the hold; a process that is merely woken
@@ -239,33 +238,6 @@ def _lives(number: int) -> bool:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def test_a_serial_line_that_was_unplugged_is_read_again_and_answers_go_out(tmp_path):
-    with Cable(tmp_path) as cable, SerialApart(str(cable.host), 921_600) as link:
-        sender = os.open(cable.sender, os.O_RDWR | os.O_NOCTTY)
-        wait_for(
-            lambda: os.write(sender, cobs.encode(packet(0, 0)) + b"\0") and link.receive(20),
-            poll_s=0.02,
-        )
-        link.send(TimeRequest(7, 8))
-        answer = b""
-        while not answer.endswith(b"\0"):
-            answer += os.read(sender, 100)
-        assert decode(cobs.decode(answer[:-1])) == TimeRequest(7, 8)
-        os.close(sender)
-        cable.pull()
-        wait_for(lambda: not link.receive(20) and link.link_counts.lost == 1)
-        cable.plug()
-        wait_for(lambda: not link.receive(20) and link.reconnects == 1)
-        sender = os.open(cable.sender, os.O_RDWR | os.O_NOCTTY)
-        wait_for(
-            lambda: os.write(sender, cobs.encode(packet(1, 0)) + b"\0") and link.receive(20),
-            poll_s=0.02,
-        )
-        os.close(sender)
-        assert link.link_counts.lost == 1
-        assert "receiver-failed" not in link._notices.counts()
 
 
 def test_basilisks_topic_and_long_messages_pass_through():

@@ -7,20 +7,25 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from ipaddress import ip_address
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from hilstar.attitude.wire.endpoint import AllowedSenders
+from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
 from hilstar.attitude.wire.roads import ANSWERS, ByteRoad
+from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
+from hilstar.attitude.wire.udp import UdpRoad
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.server.answers.reader import HELD_S
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
+from tests.support.wire.far_ends import SerialFar
 
 SOON_MS = 20
 
@@ -222,3 +227,92 @@ def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path)
         assert taken(link) == b"" and "cannot be read (No such file" in link.trouble
         path.symlink_to("/dev/zero")
         assert taken(link) == b"" and "a device" in link.trouble
+
+
+@pytest.mark.parametrize("kind", ["serial", "tcp"])
+def test_a_road_that_is_lost_is_tried_at_growing_intervals_and_told_as_its_user_s(tmp_path, kind):
+    """A read that opens it brings nothing, and none waits for longer than it may."""
+    clock, notices = FakeClock(), Notices()
+    with lost_road(kind, tmp_path, clock, notices) as (road, bring_back):
+        assert road.link_counts.lost == 1 and notices.counts() == {"answers-lost": 1}
+        tries_ns: list[int] = []
+        opens = road._open if isinstance(road, SerialRoad) else road._connect
+
+        def tried() -> None:
+            tries_ns.append(clock.now_ns())
+            opens()
+
+        name = "_open" if isinstance(road, SerialRoad) else "_connect"
+        setattr(road, name, tried)
+        begun_ns = clock.now_ns()
+        while len(tries_ns) < 6:
+            before_ns = clock.now_ns()
+            assert road.taken(SOON_MS) == []
+            assert not road.put(b"?") and not road.wait_for_message(0)
+            assert clock.now_ns() - before_ns <= SOON_MS * 1_000_000
+        waits_s = np.diff([begun_ns, *tries_ns]) / 1e9
+        assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.25, 0.25, 0.25], abs=0.001)
+        bring_back()
+        while road.openings < 2:
+            assert road.taken(SOON_MS) == []
+        assert (road.reconnects, road.link_counts.lost) == (1, 1)
+        assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
+        assert road.put(b"?")
+
+
+@contextlib.contextmanager
+def lost_road(
+    kind: str, folder: Path, clock: FakeClock, notices: Notices
+) -> Iterator[tuple[SerialRoad | TcpRoad, Callable[[], None]]]:
+    """A road to a tracker that has gone, and what brings the tracker back."""
+    with contextlib.ExitStack() as stack:
+        if kind == "serial":
+            far = SerialFar(folder)
+            road = SerialRoad(str(folder / "port"), 115_200, ANSWERS, notices, clock)
+            stack.enter_context(road)
+            far.vanish()
+            wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
+            yield road, far.come
+            far.vanish()
+            return
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            place = ("127.0.0.1", server.getsockname()[1])
+            road = TcpRoad(place, AllowedSenders(), ANSWERS, notices, clock, listening=False)
+            stack.enter_context(road)
+            assert road.taken(SOON_MS) == [] and road.openings == 1
+            server.accept()[0].close()
+            wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
+
+        def come_back() -> None:
+            stack.enter_context(socket.create_server(place))
+
+        yield road, come_back
+
+
+def test_a_tracker_that_is_asked_over_udp_is_the_only_one_that_is_heard():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as tracker:
+        tracker.bind(("127.0.0.1", 0))
+        place = tracker.getsockname()
+        with (
+            UdpRoad(place, AllowedSenders(), ANSWERS) as road,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+        ):
+            assert road.endpoint == f"udp://127.0.0.1:{place[1]}"
+            assert road.put(b"?")
+            asked, asker = tracker.recvfrom(10)
+            assert asked == b"?"
+            stranger.sendto(b"lies", asker)
+            tracker.sendto(b"answer", asker)
+            assert taken(road) == b"answer" and taken(road) == b""
+            assert (road.openings, road.reconnects) == (1, 0)
+
+
+def test_a_bound_udp_road_sends_to_nobody_by_itself():
+    with (
+        UdpRoad(UdpPlace(ip_address("127.0.0.1"), 0), AllowedSenders(), ANSWERS) as road,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as tracker,
+    ):
+        tracker.connect(("127.0.0.1", int(road.endpoint.rpartition(":")[2])))
+        tracker.send(b"answer")
+        assert taken(road) == b"answer"
+        assert not road.put(b"?")

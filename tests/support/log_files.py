@@ -119,7 +119,7 @@ class LogFile:
     """A file of a format.
 
     `own_times`: each attitude has its time with it, and nothing else in the file moves it.
-    `checked`: a checksum is over each. `slow`: reading takes a process of its own.
+    `checked`: a checksum is over each. `trials`: how often it is read, damaged, in a test.
     """
 
     format_name: str
@@ -127,7 +127,7 @@ class LogFile:
     stated: Stated = NOTHING_STATED
     own_times: bool = False
     checked: bool = False
-    slow: bool = False
+    trials: int = 40
 
 
 # One of each format, by its name.
@@ -145,7 +145,7 @@ FILES: dict[str, LogFile] = {
             "a CIC AEM", text_file("a.cic", cic_text(["60310 0.0 1 0 0 0", "60310 1.0 1 0 0 0"]))
         ),
         LogFile("an STK attitude file", text_file("a.a", stk_text(["0 0 0 0 1", "1 0 0 0 1"]))),
-        LogFile("a SPICE CK", c_kernel, slow=True),
+        LogFile("a SPICE CK", c_kernel),
     )
 }
 ULOG = LogFile("a ULog of PX4", text_file("a.ulg", "ULog\x01\x12\x35\x01"))  # always refused
@@ -169,7 +169,7 @@ FORMS: dict[str, LogFile] = {
     "a CCSDS AEM, XML": LogFile("a CCSDS AEM", written("a.xml")),
     # of a chunk that is packed whole, a byte may be in every message
     **{
-        name: LogFile("a ROS bag", make, own_times="MCAP" not in name)
+        name: LogFile("a ROS bag", make, own_times="MCAP" not in name, trials=15)
         for name, make in BAGS.items()
     },
 }

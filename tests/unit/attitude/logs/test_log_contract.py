@@ -14,7 +14,6 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.errors import HilstarError, InputError
 from tests.support.log_files import FILES, FORMS, LEVEL, SAMPLES, ULOG, LogFile, spoiled
 
-CUTS, SPOILED, SLOW_TRIALS = 60, 60, 6
 MAX_SPOILED_BYTES = 7
 NORM_TOLERANCE = 1e-9
 MAX_LINE_CHARACTERS = 1000
@@ -22,7 +21,10 @@ TEXTS = ["CSV", "JSON lines", "a CCSDS AEM, written", "a CCSDS AEM, XML", "a CIC
 WRITERS = {ending: each for each in log_formats() if each.write for ending in each.endings}
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
+FAST_FORMS = {name: form for name, form in FORMS.items() if name != "a SPICE CK"}
+
 each_form = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+each_fast_form = pytest.mark.parametrize("form", FAST_FORMS.values(), ids=FAST_FORMS)
 
 
 def refusal(path, stated=NOTHING_STATED):
@@ -89,33 +91,30 @@ def test_a_whole_file_is_read_and_what_is_read_of_it_is_written_in_every_form(tm
         assert all(map(same, again, samples))
 
 
-@each_form
-def test_a_file_that_is_cut_anywhere_is_refused_in_one_line_or_gives_the_beginning(tmp_path, form):
-    path = form.make(tmp_path)
+def cut(path, form: LogFile, trials: int) -> None:
+    """Cut a file all over, and in the midst of its last attitude."""
     samples = whole_samples(path, form)
     data = path.read_bytes()
-    if form.slow:
-        sizes = range(0, len(data), len(data) // SLOW_TRIALS)
-    else:  # and in the midst of the last attitude
-        sizes = sorted({*range(0, len(data), len(data) // CUTS), *range(len(data))[-CUTS:]})
-    for size in sizes:
+    sizes = {*range(0, len(data), len(data) // trials), *range(len(data))[-trials:]}
+    for size in sorted(sizes):
         path.write_bytes(data[:size])
         found = read_or_refused(path, form)
-        assert found is None or all(map(same, found, samples[: len(found)])), size
         assert found is None or len(found) <= len(samples), size
+        assert found is None or all(map(same, found, samples[: len(found)])), size
 
 
-@each_form
-def test_a_file_that_is_spoiled_is_refused_in_one_line_or_read_in_order(tmp_path, form):
-    """Where each attitude has its own time, no byte moves the time of another; where a checksum is
-    over each, what is read is what was written.
-    """
-    path = form.make(tmp_path)
+@each_fast_form
+def test_a_file_that_is_cut_anywhere_is_refused_in_one_line_or_gives_the_beginning(tmp_path, form):
+    cut(form.make(tmp_path), form, form.trials)
+
+
+def spoil(path, form: LogFile, trials: int) -> None:
+    """Spoil a file at random, and cut some of those."""
     samples = whole_samples(path, form)
     times = {sample.t_ns for sample in samples}
     data = path.read_bytes()
     rng = np.random.default_rng(11)
-    for _ in range(SLOW_TRIALS if form.slow else SPOILED):
+    for _ in range(trials):
         count = int(rng.integers(1, MAX_SPOILED_BYTES + 1))
         changed = spoiled(data, rng, count)
         if rng.random() < 0.3:
@@ -128,27 +127,54 @@ def test_a_file_that_is_spoiled_is_refused_in_one_line_or_read_in_order(tmp_path
             assert all(map(same, found, samples[: len(found)]))
 
 
-@each_form
-def test_noise_behind_the_beginning_of_a_file_is_refused_in_one_line(tmp_path, form):
-    path = form.make(tmp_path)
+@each_fast_form
+def test_a_file_that_is_spoiled_is_refused_in_one_line_or_read_in_order(tmp_path, form):
+    """Where each attitude has its own time, no byte moves the time of another; where a checksum is
+    over each, what is read is what was written.
+    """
+    spoil(form.make(tmp_path), form, form.trials)
+
+
+def noise_behind(path, trials: int) -> None:
+    """Noise behind the first bytes of a file: a whole first line would be that of a log, whose
+    second is wrong.
+    """
     data = path.read_bytes()
     rng = np.random.default_rng(5)
-    for k in range(SLOW_TRIALS if form.slow else 20):
+    for k in range(trials):
         noise = rng.integers(0, 256 if k % 2 else 128, size=300, dtype=np.uint8)
-        # a whole first line would be that of a log, whose second is wrong
         path.write_bytes(data[: rng.integers(0, 24)] + noise.tobytes())
         refusal(path)
 
 
-@each_form
-def test_what_a_file_holds_and_not_its_name_says_what_it_is(tmp_path, form):
-    path = form.make(tmp_path)
+@each_fast_form
+def test_noise_behind_the_beginning_of_a_file_is_refused_in_one_line(tmp_path, form):
+    noise_behind(form.make(tmp_path), 20)
+
+
+def renamed(path, form: LogFile, endings: list[str]) -> None:
+    """Read a file under other names."""
     samples = whole_samples(path, form)
-    for ending in [".dat"] if form.slow else [".dat", *WRITERS]:
+    for ending in endings:
         path = path.rename(path.with_name(f"log{ending}"))
         assert format_of(path).name == form.format_name
         found = whole_samples(path, form)
         assert len(found) == len(samples) and all(map(same, found, samples))
+
+
+@each_fast_form
+def test_what_a_file_holds_and_not_its_name_says_what_it_is(tmp_path, form):
+    renamed(form.make(tmp_path), form, [".dat", *WRITERS])
+
+
+def test_all_that_holds_of_a_file_that_a_process_of_its_own_reads(tmp_path):
+    form = FORMS["a SPICE CK"]
+    for claim, trials in ((cut, 4), (spoil, 6)):
+        claim(form.make(tmp_path), form, trials)
+        (tmp_path / "a.bc").unlink()
+    noise_behind(form.make(tmp_path), 6)
+    (tmp_path / "a.bc").unlink()
+    renamed(form.make(tmp_path), form, [".dat"])
 
 
 @pytest.mark.parametrize("name", TEXTS)

@@ -8,6 +8,7 @@ H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200. cha
 chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
+beside_*.csv are `python tools/beside.py NAME -o DIR`, and no machine changes them.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine
 changes it.
 """
@@ -17,6 +18,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -499,7 +501,25 @@ def certify_table() -> str:
     return table(head, body)
 
 
+BESIDE = ("galsim", "astrometry")
+
+
+def beside_table(name: str) -> str:
+    """What stands between hilstar and an independent program, cause by cause."""
+    body = []
+    subject = ""
+    for row in rows_of(f"beside_{name}.csv"):
+        first = row["subject"] if row["subject"] != subject else ""
+        subject = row["subject"]
+        size = two_digits(float(row["size"]))
+        body.append([first, row["step"], f"{size} {UNIT_WORDS.get(row['unit'], row['unit'])}"])
+    version = f"{row['program']} {row['version']}, {row['date']}"
+    return table([version, "taken out, one after the other", "difference"], body)
+
+
+UNIT_WORDS = {"relative": "of it"}
 TABLES = {
+    **{f"beside_{name}": partial(beside_table, name) for name in BESIDE},
     "answers": answers_table,
     "certify": certify_table,
     "colour": colour_table,

@@ -9,6 +9,7 @@ import re
 import select
 import termios
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
@@ -63,17 +64,13 @@ def adapters() -> list[str]:
     (0403:6001)".
     """
     ports = sorted(list_ports.comports())
-    lines = []
+    kinds: Counter[str] = Counter()
     for port in ports:
-        lines.append(
-            f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
-            if port.vid is not None
-            else "UART"
-        )
-    return [
-        f"{lines.count(word)} x {word}" if lines.count(word) > 1 else word
-        for word in dict.fromkeys(lines)
-    ]
+        kind = "UART"
+        if port.vid is not None:
+            kind = f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
+        kinds[kind] += 1
+    return [f"{count} x {kind}" if count > 1 else kind for kind, count in kinds.items()]
 
 
 def open_port(port: str, baud: int) -> serial.Serial:

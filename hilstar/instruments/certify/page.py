@@ -31,7 +31,7 @@ from hilstar.basics.pages import (
     table_of,
 )
 from hilstar.instruments.certify.model import THIRDS
-from hilstar.server.bench.certificate import Certificate, CertifiedFigure
+from hilstar.server.bench.certificate_file import Certificate, CertifiedFigure
 
 VERDICTS = {
     True: (OK, "Conforms"),

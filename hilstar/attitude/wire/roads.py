@@ -10,7 +10,8 @@ Laws:
 2. Losing the other side raises nothing: it is counted, told once, and the road is opened again, at
    first after MIN_BACK_OFF_S and at least each MAX_BACK_OFF_S; that it is back is told once.
 3. A read that opens the road brings nothing: what a read brings is of the opening before it.
-4. A read waits at most as long as it is told to, and a write never, where it is not told to.
+4. A read waits at most as long as it is told to (or for TCP's handshake, 0.3 s), and a write never,
+   where it is not told to.
 """
 
 import errno

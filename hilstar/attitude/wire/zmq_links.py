@@ -21,14 +21,13 @@ from hilstar.attitude.wire.links import (
     PacketDecoder,
     StreamLink,
 )
-from hilstar.attitude.wire.roads import ATTITUDES, ByteRoad, RawMessage
+from hilstar.attitude.wire.roads import ATTITUDES, ByteRoad, LinkCounts, RawMessage
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.attitude.wire.zmq_socket import (
     QUEUE_MESSAGES,
     SocketOptions,
     ZmqReply,
     ZmqSocket,
-    reconnects_of,
     trouble_of,
 )
 from hilstar.basics.notices import Notices
@@ -120,11 +119,6 @@ class ZmqRoadApart(ByteRoad):
         self._reader = ReaderProcess(self._notices, clock=clock)
 
     @property
-    def reconnects(self) -> int:
-        """See `ZmqSocket.reconnects`."""
-        return reconnects_of(self.link_counts, bound=self._bound)
-
-    @property
     def trouble(self) -> str:
         """See `ZmqSocket.trouble`."""
         return trouble_of(self.link_counts, self._notices)
@@ -156,8 +150,14 @@ class ZmqRoadApart(ByteRoad):
                 if record.message is not None:
                     self._waiting.append(record.message)
                 if record.counts is not None:
-                    self.link_counts += record.counts
+                    self._count(record.counts)
         return bool(self._waiting)
+
+    def _count(self, grown: LinkCounts) -> None:
+        """Take what the other process has counted, and told, since it did so last."""
+        self.link_counts += grown
+        if not self._bound:
+            self.openings = self.link_counts.connections
 
     def close(self) -> None:
         """End the process, and with it the socket."""

@@ -15,8 +15,9 @@ import os
 import resource
 import socket
 import struct
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, TypedDict, Unpack
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple, TypedDict, Unpack
 
 import zmq
 
@@ -29,7 +30,14 @@ from hilstar.attitude.wire.keys import (
     load_public,
     load_secret,
 )
-from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, LinkCounts, RawMessage
+from hilstar.attitude.wire.roads import (
+    ATTITUDES,
+    PAUSE_S,
+    ByteRoad,
+    LinkCounts,
+    RawMessage,
+    RoadUse,
+)
 from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -50,6 +58,11 @@ WANTED_FILES = 65_536
 MAX_CONNECTIONS = 64
 MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50
+SENDER = replace(
+    ATTITUDES,
+    lost_line="lost the connection to the sender; waiting for it",
+    back_line="reconnected to the sender",
+)
 # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 EVENT = struct.Struct("=Hi")
 HANDSHAKE_MS = 2000
@@ -152,6 +165,13 @@ def _raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+class ConnectionsTold(NamedTuple):
+    """Who is told that a connection that we made has had its handshake, and why it ended."""
+
+    opened: Callable[[], None]
+    lost: Callable[[str], None]
+
+
 class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
@@ -167,6 +187,7 @@ class _Doorkeeper:
         *,
         look: PeerLook | None,
         counts: LinkCounts,
+        told: ConnectionsTold,
         notices: Notices,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
@@ -176,6 +197,7 @@ class _Doorkeeper:
         self._watched = watched
         self._look = look
         self._counts = counts
+        self._told = told
         self._notices = notices
         self._clock = clock
         self._bound = look is None
@@ -229,10 +251,7 @@ class _Doorkeeper:
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._greeted = True
             self._counts.connections += 1
-            if self._counts.connections > 1:
-                self._notices.tell("back", "reconnected to the sender")
-            else:
-                self._notices.mention("connected", "connected to the sender")
+            self._told.opened()
         elif event in FAILED:
             self._failure = FAILED[zmq.Event(event)]
 
@@ -266,8 +285,7 @@ class _Doorkeeper:
             self._counts.rejected += 1
             self._look.begin()
         else:
-            self._counts.lost += 1
-            self._notices.tell("lost", "lost the connection to the sender; waiting for it")
+            self._told.lost("the other side closed it")
 
     def _tell_look(self) -> None:
         trouble = "" if self._look is None else self._look.take()
@@ -323,7 +341,7 @@ def zmq_version() -> str:
 
 class SocketOptions(TypedDict, total=False):
     """How a socket is opened: whether it binds, whose keys it has, who hears of it, its largest
-    part, and the clock.
+    part, the clock, and what it is for.
     """
 
     bind: bool
@@ -331,10 +349,13 @@ class SocketOptions(TypedDict, total=False):
     notices: Notices | None
     max_part_bytes: int
     clock: HostClock
+    use: RoadUse
 
 
 class ZmqSocket(ByteRoad):
     """A socket and its context, bound or connected; reopened after a flood.
+
+    Only what it connects to is lost and comes back: to one that binds, any number connect.
 
     A socket that binds is opened at once, to check that it can be. One that receives a stream is
     then closed until its first read, so that no old messages and no flood collect in it while the
@@ -346,7 +367,7 @@ class ZmqSocket(ByteRoad):
 
     def __init__(self, kind: int, endpoint: str, **options: Unpack[SocketOptions]) -> None:
         clock = options.get("clock", HOST_CLOCK)
-        super().__init__(endpoint, ATTITUDES, options.get("notices"), clock)
+        super().__init__(endpoint, options.get("use", SENDER), options.get("notices"), clock)
         self._max_part_bytes = options.get("max_part_bytes", MAX_PART_BYTES)
         bind = options.get("bind", False)
         keys = options.get("keys", NO_KEYS)
@@ -393,7 +414,12 @@ class ZmqSocket(ByteRoad):
         else:
             look = PeerLook(self._address, kind, keys=self._pair is not None)
         self._keeper = _Doorkeeper(
-            made, look=look, counts=self.link_counts, notices=self._notices, clock=self._clock
+            made,
+            look=look,
+            counts=self.link_counts,
+            told=ConnectionsTold(self._opened, self._lose),
+            notices=self._notices,
+            clock=self._clock,
         )
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
@@ -451,11 +477,6 @@ class ZmqSocket(ByteRoad):
         return self._socket
 
     @property
-    def reconnects(self) -> int:
-        """See `ByteRoad.reconnects`: none where any number of senders connect to us."""
-        return reconnects_of(self.link_counts, bound=self._bind)
-
-    @property
     def bound(self) -> bool:
         """Whether others connect to it."""
         return self._bind
@@ -464,6 +485,11 @@ class ZmqSocket(ByteRoad):
     def trouble(self) -> str:
         """See `ByteRoad.trouble`: what is there in the place of a partner."""
         return trouble_of(self.link_counts, self._notices)
+
+    def _opened(self) -> None:
+        super()._opened()
+        if self.openings == 1:
+            self._notices.mention("connected", "connected to the sender")
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         """The waiting messages, oldest first; see `ByteRoad.taken`."""
@@ -597,15 +623,6 @@ class ZmqReply(ZmqSocket):
     def put_parts(self, parts: list[bytes]) -> bool:
         """Reply with a message of several parts."""
         return self._put(parts)
-
-
-def reconnects_of(counts: LinkCounts, *, bound: bool) -> int:
-    """How often the other side of a socket came back: never where any number of senders connect to
-    it.
-    """
-    if bound:
-        return 0
-    return max(0, counts.connections - 1)
 
 
 def trouble_of(counts: LinkCounts, notices: Notices) -> str:

@@ -110,7 +110,9 @@ class ReadPlan:
         endpoint = settings.endpoint or ZMQ_ENDPOINT
         bind = settings.bind is True
         try:
-            return ZmqRoad(endpoint, bind=bind, keys=keys, notices=notices, clock=clock)
+            return ZmqRoad(
+                endpoint, bind=bind, keys=keys, notices=notices, clock=clock, use=ANSWERS
+            )
         except InputError as error:
             raise InputError(f"[answers] endpoint: {error}") from error
 

@@ -107,11 +107,11 @@ class ZmqFar(FarEnd):
 
     def __init__(self, folder: Path, *, apart: bool = False) -> None:
         self._apart = apart
-        self._port = free_port()
+        self.place = f"tcp://{LOOPBACK}:{free_port()}"
         super().__init__(folder)
 
     def link(self, notices: Notices) -> StreamLink:
-        receiver = ZmqReceiver(f"tcp://{LOOPBACK}:{self._port}", notices=notices)
+        receiver = ZmqReceiver(self.place, notices=notices)
         return ZmqApart(receiver, notices) if self._apart else receiver
 
     def come(self) -> None:
@@ -122,7 +122,7 @@ class ZmqFar(FarEnd):
 
         def bound() -> bool:
             with contextlib.suppress(zmq.ZMQError):
-                self._socket.bind(f"tcp://{LOOPBACK}:{self._port}")
+                self._socket.bind(self.place)
                 return True
             return False
 
@@ -143,7 +143,7 @@ class VizardFar(ZmqFar):
 
     def link(self, notices: Notices) -> StreamLink:
         follower = Follower(None, Mounting(), DifferenceRates(10**9, 1.0), "attitude")
-        link = vizard_broadcast(f"tcp://{LOOPBACK}:{self._port}", follower, notices=notices)
+        link = vizard_broadcast(self.place, follower, notices=notices)
         return ZmqApart(link, notices) if self._apart else link
 
     def message(self, number: int, *, jump: bool = False) -> bytes:

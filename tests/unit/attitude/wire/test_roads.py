@@ -20,12 +20,13 @@ from hilstar.attitude.wire.roads import ANSWERS, ByteRoad
 from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.attitude.wire.udp import UdpRoad
+from hilstar.attitude.wire.zmq_links import ZmqRoad
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.server.answers.reader import HELD_S
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
-from tests.support.wire.far_ends import SerialFar
+from tests.support.wire.far_ends import SerialFar, ZmqFar
 
 SOON_MS = 20
 
@@ -316,3 +317,21 @@ def test_a_bound_udp_road_sends_to_nobody_by_itself():
         tracker.send(b"answer")
         assert taken(road) == b"answer"
         assert not road.put(b"?")
+
+
+def test_a_tracker_over_zeromq_that_vanishes_is_told_as_the_tracker_and_not_as_the_sender(tmp_path):
+    far, notices = ZmqFar(tmp_path), Notices()
+    with ZmqRoad(far.place, notices=notices, use=ANSWERS) as road:
+
+        def heard() -> bool:
+            far.put(b"answer")
+            return taken(road)[:6] == b"answer"
+
+        wait_for(heard, "the road", poll_s=0.005)
+        far.vanish()
+        wait_for(lambda: not taken(road) and road.link_counts.lost == 1, "the loss")
+        far.come()
+        wait_for(heard, "the road again", poll_s=0.005)
+        assert (road.openings, road.reconnects) == (2, 1)
+    far.vanish()
+    assert notices.counts() == {"answers-lost": 1, "answers-back": 1}

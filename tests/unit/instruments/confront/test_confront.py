@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -98,6 +99,26 @@ def test_raw_frames_give_the_camera_that_was_measured_apart(
     assert not camera["tone_curve"]
     # names of the files say 40 and 60 deg: refraction alone told it
     assert [image["altitude_deg"] for image in found["images"]] == pytest.approx([40, 60], abs=6)
+
+
+def test_the_page_has_the_stars_first_by_the_names_of_the_sky(
+    raw: tuple[Path, dict[str, Any]],
+) -> None:
+    text = (raw[0] / "out" / "index.html").read_text()
+    titles = re.findall("<h2>(.*?)</h2>", text)
+    assert titles[:2] == [path.name for path in RAW[::2]] and titles[-1] == "Notes"
+    named = re.findall("<text [^>]*>(.*?)</text>", text)
+    assert {"\N{GREEK SMALL LETTER BETA} Cas", "\N{GREEK SMALL LETTER SIGMA} Cas"} < set(named)
+    assert len(named) == 2 * page.MAX_NAMED
+
+
+def test_a_picture_that_is_made_smaller_keeps_its_stars() -> None:
+    image = np.zeros((50, 101))
+    image[49, 100] = image[7, 20] = 9.0
+    small = page.brightest(image, 40)
+    assert small.shape == (17, 34) and small.sum() == 18.0
+    assert small[16, 33] == small[2, 6] == 9.0
+    assert page.brightest(image, 101) is image
 
 
 def test_raw_frames_agree_within_the_aims(raw: tuple[Path, dict[str, Any]]) -> None:

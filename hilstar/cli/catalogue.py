@@ -22,9 +22,11 @@ def catalogue(
             help="The table; its ending says what it is.",
         ),
     ],
-    to: Annotated[
+    faintest: Annotated[
         float | None,
-        Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40),
+        Option(
+            "--faintest", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40
+        ),
     ] = None,
     epoch: Annotated[
         float | None,
@@ -51,7 +53,7 @@ def catalogue(
         )
     check_outputs([bench_file], [output])
     file = read_bench_file(bench_file)
-    bench_stars = bench_catalogue(file, to, epoch)
+    bench_stars = bench_catalogue(file, faintest, epoch)
     write_catalogue(output, bench_stars)
     fields = {
         "file": str(output),

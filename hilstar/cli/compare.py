@@ -25,10 +25,11 @@ def compare(
         Path | None, Option(metavar="TRUTH.csv", help="B's stars, from `hilstar frame --truth`.")
     ] = None,
     flux_mag: Annotated[
-        float | None, Option(help="Largest flux error of a star; 0.001 by default.")
+        float | None, Option(metavar="MAG", help="Largest flux error of a star; 0.001 by default.")
     ] = None,
     centroid_px: Annotated[
-        float | None, Option(help="Largest centroid error of a star; 0.001 by default.")
+        float | None,
+        Option(metavar="PX", help="Largest centroid error of a star; 0.001 by default."),
     ] = None,
     output: Annotated[
         Path | None,

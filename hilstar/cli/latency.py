@@ -26,7 +26,7 @@ def latency(
         ),
     ] = None,
     duration: Annotated[
-        float, Option(help="How long to read edges, in seconds.", min=0.5, max=3600)
+        float, Option(metavar="SECONDS", help="How long to read edges.", min=0.5, max=3600)
     ] = 10.0,
     save: Annotated[
         Path | None, Option(metavar="EDGES.csv", help="Save the edges that were read.")

@@ -21,11 +21,16 @@ Output = Annotated[
     Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")
 ]
 Oversampling = Annotated[
-    int, Option(help="Samples a tracker pixel along each axis.", min=1, max=64)
+    int, Option(metavar="N", help="Samples a tracker pixel along each axis.", min=1, max=64)
 ]
 Tolerance = Annotated[
     float,
-    Option(help="Share of a PSF's light that the file's basis may put elsewhere.", min=0, max=0.1),
+    Option(
+        metavar="SHARE",
+        help="Share of a PSF's light that the file's basis may put elsewhere.",
+        min=0,
+        max=0.1,
+    ),
 ]
 
 
@@ -71,6 +76,7 @@ def zernike(
     oversampling: Annotated[
         int | None,
         Option(
+            metavar="N",
             help="Samples a tracker pixel along each axis; by default as diffraction needs.",
             min=1,
             max=64,
@@ -107,6 +113,7 @@ def lens(
         float | None,
         Option(
             "--pitch-um",
+            metavar="UM",
             help="The tracker's pixel pitch, in place of the bench's.",
             min=0.1,
             max=1000,
@@ -125,11 +132,12 @@ def lens(
         ),
     ] = "0",
     half_px: Annotated[
-        int, Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)
+        int, Option("--half-px", metavar="PX", help="Half of a stamp's side, px.", min=1, max=100)
     ] = 8,
     oversampling: Annotated[
         int | None,
         Option(
+            metavar="N",
             help="Samples a tracker pixel along each axis; by default as diffraction needs.",
             min=1,
             max=64,

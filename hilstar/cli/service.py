@@ -15,6 +15,7 @@ from typer import Argument, Option
 
 from hilstar.basics.errors import InputError, cannot_write, shortened
 from hilstar.basics.files import refuse_existing, write_whole
+from hilstar.cli.old_names import with_present_names
 from hilstar.cli.options import BenchFile, Overwrite, with_values
 from hilstar.cli.running import UTC_MARK
 from hilstar.cli.serve import serve
@@ -192,7 +193,7 @@ def _systemctl(*words: str) -> bool:
 def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
     from hilstar.server.console.listener import parse_address
 
-    option_words = with_values(options)
+    option_words = with_values(with_present_names(["serve", *options])[1:])
     alone = typer.Typer()
     alone.command()(serve)
     try:

@@ -153,18 +153,16 @@ class ExactQuantiser(quantise.Quantiser):
     @classmethod
     def cost(cls, psf: Psf, gl_version: int) -> quantise.LevelCost:
         """The cost of the shader, or of NumPy where the shader cannot draw."""
-        has_compute = gl_version >= COMPUTE_VERSION
-        if _fits(psf):
-            by_numpy_ms = NUMPY_EXACT_MS_A_STAR
-        else:
-            by_numpy_ms = WIDE_EXACT_MS_A_STAR
-        if has_compute:
-            why = ""
-        else:
+        why = ""
+        if gl_version < COMPUTE_VERSION:
             why = "in NumPy: its compute shaders need OpenGL 4.3"
-        return quantise.LevelCost(
-            EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why
-        )
+        if cls.takes(psf, gl_version):
+            ms_a_star = EXACT_MS_A_STAR
+        elif _fits(psf):
+            ms_a_star = NUMPY_EXACT_MS_A_STAR
+        else:
+            ms_a_star = WIDE_EXACT_MS_A_STAR
+        return quantise.LevelCost(ms_a_star, why)
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:

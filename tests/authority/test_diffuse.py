@@ -19,7 +19,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import direction_of, from_radec_roll_deg, to_matrix
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.extended import LightMap
-from hilstar.optics.layers.diffuse import DiffuseLayer
+from hilstar.optics.layers.diffuse_layer import DiffuseLayer
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.star_rates import star_rates

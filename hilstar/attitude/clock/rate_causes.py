@@ -285,9 +285,12 @@ def _permutations() -> Iterator[Cause]:
                 continue
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
-            sent = ", ".join(
-                ("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3)
-            )
+            axes_sent = []
+            for camera_axis in range(3):
+                place = order.index(camera_axis)
+                sign = "" if signs[place] > 0 else "-"
+                axes_sent.append(sign + "xyz"[place])
+            sent = ", ".join(axes_sent)
             if order == (0, 1, 2):
                 what = "some of their axes have the wrong sign"
             else:
@@ -438,9 +441,8 @@ def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float)
     """
     if len(stretches) < MORE_STRETCHES:
         return None
-    turns, rates = (
-        np.array([getattr(stretch, name) for stretch in stretches]) for name in ("turn", "rate")
-    )
+    turns = np.array([stretch.turn for stretch in stretches])
+    rates = np.array([stretch.rate for stretch in stretches])
     factor = float((rates * rates).sum()) / float((rates * turns).sum() or math.inf)
     if abs(factor) > 0:
         times = Cause(
@@ -563,10 +565,8 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     zero_ns = stretches[0].from_ns
     parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
     t_s = np.concatenate([[0.0], *parts])
-    turned, summed = (
-        _joined([getattr(stretch, name) for stretch in stretches])
-        for name in ("turned_rad", "summed_rad")
-    )
+    turned = _joined([stretch.turned_rad for stretch in stretches])
+    summed = _joined([stretch.summed_rad for stretch in stretches])
     edges_s = np.arange(MAX_LAG_S, t_s[-1] - MAX_LAG_S, LAG_SPAN_S)
     if t_s[-1] < MIN_HISTORY_S or len(edges_s) <= MIN_TURNS:
         return None

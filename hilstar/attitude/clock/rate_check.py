@@ -74,7 +74,10 @@ def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) ->
     length = _Length(0.0)
     others = tuple(read_otherwise(readings(read_as)))
     for sample in samples:
-        if length.add(sample) and (cause := _first_cause(length, math.inf, others)) is not None:
+        if not length.add(sample):
+            continue
+        cause = _first_cause(length, math.inf, others)
+        if cause is not None:
             return cause
     return None
 
@@ -83,11 +86,10 @@ def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -
     """What the newest stretches of a length show, few of them first."""
     for count in (MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES):
         newest = length.newest(count)
-        if (
-            newest
-            and (cause := cause_of(newest, length.length_s or LONGEST_S, history_s, others))
-            is not None
-        ):
+        if not newest:
+            continue
+        cause = cause_of(newest, length.length_s or LONGEST_S, history_s, others)
+        if cause is not None:
             return cause
     return None
 

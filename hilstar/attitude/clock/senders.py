@@ -503,10 +503,13 @@ class Senders:
 
     def _decided(self, main: _Counter) -> list[SampleArrival]:
         """What is held, with a refusal but for those messages of this counter."""
-        return [
-            held.arrival if held.counter is main else _refused_beside(held)
-            for held in self._emptied()
-        ]
+        arrivals: list[SampleArrival] = []
+        for held in self._emptied():
+            if held.counter is main:
+                arrivals.append(held.arrival)
+            else:
+                arrivals.append(_refused_beside(held))
+        return arrivals
 
     def _gives_way(self, main: _Counter, counter: _Counter, silent_ns: int) -> bool:
         """Whether the counter shown has been silent for so long that another takes its place."""

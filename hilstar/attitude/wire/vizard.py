@@ -389,10 +389,8 @@ class VizardLive(ZmqSocket, LockstepLink):
         word = parts[0]
         if word == SIM_UPDATE:
             return self._step(host_ns, parts)
-        if (
-            word.startswith(REQUEST_IMAGE)
-            and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit()
-        ):
+        number = word.removeprefix(REQUEST_IMAGE)[:MAX_DIGITS]
+        if word.startswith(REQUEST_IMAGE) and number.isdigit():
             image = self._picture(int(number))
             # the length goes ahead, big-endian; 0 where there is none
             self._answer([len(image).to_bytes(4, "big"), image])
@@ -415,9 +413,8 @@ class VizardLive(ZmqSocket, LockstepLink):
             )
         event, update = self._follower.take(message)
         self._sample = event if isinstance(event, wire.AttitudeSample) else None
-        self._described |= {
-            camera.identity: camera for camera in (update.cameras if update is not None else ())
-        }
+        if update is not None:
+            self._described |= {camera.identity: camera for camera in update.cameras}
         return Arrival(host_ns, event, message)
 
     def _picture(self, camera: int) -> bytes:

@@ -103,11 +103,10 @@ class ZmqReceiver(ZmqSocket, StreamLink):
             return []
         waiting: list[RawMessage] = []
         taken_bytes = 0
-        while (
-            len(waiting) < QUEUE_MESSAGES
-            and taken_bytes < MAX_TAKEN_BYTES
-            and (parts := self._take_parts()) is not None
-        ):
+        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES:
+            parts = self._take_parts()
+            if parts is None:
+                break
             waiting.append(RawMessage(self._clock.now_ns(), parts))
             taken_bytes += sum(map(len, parts))
         return self._gate.newest(waiting, wire.declares_discontinuity)

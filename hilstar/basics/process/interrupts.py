@@ -77,7 +77,9 @@ def install() -> None:
             # somewhere, too.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
-            setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
+            mode = "w" if descriptor else "r"
+            stream = open(descriptor, mode, closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
     watched, teller = socket.socketpair()
     teller.setblocking(False)
     parent = os.getpid()
@@ -355,11 +357,9 @@ class _QueuedStderr(io.RawIOBase):
                 piece = self._waiting.popleft()
                 dropped = self._dropped
                 self._dropped = 0
-            data = piece + (
-                f"hilstar: {dropped} lines were dropped: nothing read them\n".encode()
-                if dropped
-                else b""
-            )
+            data = piece
+            if dropped:
+                data += f"hilstar: {dropped} lines were dropped: nothing read them\n".encode()
             with contextlib.suppress(OSError):  # there is no reader to tell
                 while data:
                     try:

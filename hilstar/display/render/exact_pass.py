@@ -11,7 +11,7 @@ import moderngl
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, IntArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.display.balance import SUMS, Balance
 from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left, Turn
 from hilstar.display.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
@@ -226,11 +226,10 @@ class ExactPass:
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
         """The tables by which levels are chosen."""
-        return [
-            self._order.buffer,
-            self._light.buffer,
-            *([] if self._gain is None else [self._gain]),
-        ]
+        tables: list[moderngl.Texture | moderngl.Buffer] = [self._order.buffer, self._light.buffer]
+        if self._gain is not None:
+            tables.append(self._gain)
+        return tables
 
     def draw(
         self, buffer: moderngl.Buffer, sprites: FrameLight, sums: PixelSums | None = None
@@ -257,7 +256,8 @@ class ExactPass:
         elif self._memory is not None:
             self._memory.bind(sprites.star, np.zeros(count, dtype=np.bool_))
         elif self._together is not None:
-            if self._together.size < (size := count * len(self._planes.panels) * SUMS_BYTES):
+            size = count * len(self._planes.panels) * SUMS_BYTES
+            if self._together.size < size:
                 self._together.orphan(2 * size)
             self._together.bind_to_storage_buffer(FIRST_BINDING + 2)
         buffer.bind_to_storage_buffer(0)
@@ -358,13 +358,16 @@ def overrated(width_px: tuple[float, float]) -> float:
     if min(width_px) < NARROW_PX:
         return OVERRATED
     away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
-    along_x, along_y = (
-        np.maximum.accumulate([_ratio(float(place), width) for place in away]) for width in width_px
-    )
+    along_x, along_y = (_largest_ratios(away, width) for width in width_px)
     rest = np.sqrt(REACH_SIGMA**2 - away**2)
-    return OVERRATED * float(
-        (along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max()
-    )
+    along_rest = along_y[np.searchsorted(away, rest, side="right") - 1]
+    return OVERRATED * float((along_x * along_rest).max())
+
+
+def _largest_ratios(places: FloatArray, width_px: float) -> FloatArray:
+    """The largest `_ratio` up to each of rising places (n,)."""
+    ratios = [_ratio(place, width_px) for place in places.tolist()]
+    return np.maximum.accumulate(np.array(ratios))
 
 
 def _ratio(place: float, width_px: float) -> float:

@@ -45,7 +45,7 @@ from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, refus
 from hilstar.server.answers.answer import JUMP_NS
 from hilstar.server.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
-from hilstar.server.bench.certificate import Certificate, bench_certificate
+from hilstar.server.bench.certificate_file import Certificate, bench_certificate
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.record.commanded import Commanded
 from hilstar.server.record.commanded_run import NOT_SHOWN, CommandedRun, read_commanded

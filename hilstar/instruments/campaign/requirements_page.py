@@ -48,7 +48,7 @@ from hilstar.instruments.campaign.requirements import (
 from hilstar.instruments.campaign.results import VARY, Columns, read_cases
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import bench_certificate, off_by
+from hilstar.server.bench.certificate_file import bench_certificate, off_by
 
 COLUMNS = ("quantity", "axis", "condition", "limit", "bound", "confidence", "cases", "verdict")
 COLOURS = {MET: GREEN, NOT_MET: RED, NOT_SHOWN: ORANGE}

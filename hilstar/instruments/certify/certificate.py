@@ -27,7 +27,7 @@ from hilstar.instruments.certify.check import take_check
 from hilstar.instruments.certify.model import THIRDS, true_deviations
 from hilstar.instruments.certify.readings import Reader
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import (
+from hilstar.server.bench.certificate_file import (
     KIND,
     ByTrials,
     Certificate,

@@ -34,7 +34,7 @@ from hilstar.basics.pages import (
     value_text,
 )
 from hilstar.instruments.certify.model import THIRDS
-from hilstar.server.bench.certificate import Certificate, CertifiedFigure
+from hilstar.server.bench.certificate_file import Certificate, CertifiedFigure
 
 VERDICTS = {
     True: (OK, "Conforms"),

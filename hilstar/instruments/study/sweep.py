@@ -111,10 +111,10 @@ def in_turn(
 
 def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
     """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
-    return {
-        name: float(np.median([taken_time.wall_ms for taken_time in took]))
-        for name, took in in_turn(works, rounds).items()
-    }
+    medians = {}
+    for name, times in in_turn(works, rounds).items():
+        medians[name] = float(np.median([taken.wall_ms for taken in times]))
+    return medians
 
 
 def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:

@@ -140,11 +140,10 @@ class Field:
         along = np.roll(self.hull_px, -1, axis=0) - self.hull_px
         off = places[:, None] - begin
         cross_px = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
-        outside = np.flatnonzero(
-            (cross_px < -ON_EDGE_PX * self._scale).any(axis=1)
-            if len(begin) > 2
-            else np.ones(len(places), bool)
-        )
+        if len(begin) > 2:
+            outside = np.flatnonzero((cross_px < -ON_EDGE_PX * self._scale).any(axis=1))
+        else:
+            outside = np.arange(len(places))  # a line or a point has no inside
         if len(outside):
             length2 = np.maximum((along * along).sum(axis=1), 1e-300)
             part = np.clip((off[outside] * along).sum(axis=2) / length2, 0, 1)
@@ -270,14 +269,13 @@ class GlassPsf(SampledPsf):
         y, x = np.indices((height, width))
         ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
         light = np.stack([np.bincount(ring, image.ravel()) for image in self.optics.basis])
-        left_out = np.abs(
-            1 - np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)
-        ).max(axis=0)
-        wide = np.flatnonzero(left_out > MAX_CUT)
-        last = min(int(wide[-1]) + 1 if len(wide) else 0, len(left_out) - 1)
-        side = (
-            2 * math.ceil((last + 0.5) / self.per_px + (0.5 if self.pixel_integrated else 0.0)) + 1
-        )
+        light_within = np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)
+        cut = np.abs(1 - light_within).max(axis=0)
+        too_much = np.flatnonzero(cut > MAX_CUT)
+        last_ring = min(int(too_much[-1]) + 1, len(cut) - 1) if len(too_much) else 0
+        # samples of which pixels are integrated have light from half a pixel around them
+        pixel_half_px = 0.5 if self.pixel_integrated else 0.0
+        side = 2 * math.ceil((last_ring + 0.5) / self.per_px + pixel_half_px) + 1
         if side > MAX_FOOTPRINT_PX:
             raise InputError(
                 f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what"
@@ -576,9 +574,8 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
     basis = glass.basis.astype(np.float64)
     optics = Focused(basis, weights, illumination, inside)
     if lateral_px.any() or len(glass.focuses_um) > 1:
-        optics = _rebased(
-            optics, lateral_px * glass.per_px, 1 if glass.pixel_integrated else glass.per_px
-        )
+        pixel_samples = 1 if glass.pixel_integrated else glass.per_px
+        optics = _rebased(optics, lateral_px * glass.per_px, pixel_samples)
     field = Field(glass.places_px)
     return GlassPsf(
         _middle(optics, field, mean_shares),
@@ -672,9 +669,8 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
         images.append(np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)))
     gaussians = np.stack(images)
     gaussians /= gaussians.sum(axis=1, keepdims=True)
-    basis, weights, _ = principal(
-        gaussians, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px
-    )
+    pixel_samples = 1 if psf.pixel_integrated else psf.per_px
+    basis, weights, _ = principal(gaussians, optics.basis.shape[1:], TOLERANCE, pixel_samples)
     return _of_images(psf, basis.astype(np.float64), weights)
 
 
@@ -700,10 +696,12 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
     flat = optics.weights.reshape(-1, len(optics.basis))
     moves = lateral.reshape(-1, 2)
     padded = np.pad(optics.basis, ((0, 0), (room, room), (room, room)))
-    unmoved = (np.tensordot(weight, padded, axes=1) for weight in flat)
     moved = []
-    for image, move in zip(unmoved, moves, strict=True):
-        moved.append(shift(image, move[::-1], order=5) if move.any() else image)
+    for weight, move in zip(flat, moves, strict=True):
+        image = np.tensordot(weight, padded, axes=1)
+        if move.any():
+            image = shift(image, move[::-1], order=5)
+        moved.append(image)
     images = np.stack(moved)
     images /= images.sum(axis=(1, 2), keepdims=True)
     basis, weights, _ = principal(

@@ -158,9 +158,8 @@ class BodyLayer:
         reach_rad = self._reach_rad
         wide_rad = POINT_PX / self._px_per_rad
         if view.turns:
-            reach_rad += view.turn.speed_rad_s * (
-                view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
-            )
+            away_s = view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
+            reach_rad += view.turn.speed_rad_s * away_s
         axis = view.icrs_to_image(self.canvas.camera)[2]
         discs = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
         wide_discs = []

@@ -24,7 +24,7 @@ from hilstar.basics.rotation import to_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.version import __version__
 from hilstar.optics.sprites import brightest
-from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.console import messages, protocol
 from hilstar.server.console.listener import PageListener

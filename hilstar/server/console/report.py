@@ -30,7 +30,7 @@ from hilstar.server.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.server.faults import read_recording
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import EventRecord, codes_ms_of, config_of, wrong_in_frame
-from hilstar.server.record.report import (
+from hilstar.server.record.run_figures import (
     COUNTS,
     METRICS,
     RunFigures,

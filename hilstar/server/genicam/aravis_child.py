@@ -3,7 +3,7 @@
     aravis_child.py list         print the cameras, as a JSON list
     aravis_child.py grab NAME    open a camera and print a line of JSON about it; then one for each
                                  line read: {"exposure_us": ..., "file": ...} for
-                                 for an image, {"set": {...}} for features
+                                 an image, {"set": {...}} for features
 
 NAME is a serial number, VENDOR-MODEL, an address or Aravis's own identifier; "" is the only camera.
 An image's bytes go to `file`, as the camera sent them. It imports nothing of hilstar, and needs
@@ -120,6 +120,7 @@ class Camera:
             "width": buffer.get_image_width(),
             "height": buffer.get_image_height(),
             "exposure_us": exposed_us,
+            "arrived_utc_ns": buffer.get_system_timestamp(),
             "incomplete": taken - 1,
         }
 

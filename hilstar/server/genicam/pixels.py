@@ -10,7 +10,17 @@ import numpy.typing as npt
 from hilstar.basics.errors import InputError
 
 FORMAT = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG))(8|10|12|14|16)(Packed|p)?")
+BAYER = "Bayer"
+# The name has the first row alone; the second has the other two of R, G, G and B.
+MOSAICS = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}
 Dn = npt.NDArray[np.uint16]
+
+
+def mosaic_of(pixel_format: str) -> str:
+    """The colours of two rows of pixels from the top left, such as "RGGB"; "" for grey."""
+    if not pixel_format.startswith(BAYER):
+        return ""
+    return MOSAICS.get(pixel_format[len(BAYER) :][:2], "")
 
 
 def unpacked(data: bytes, pixel_format: str, width_px: int, height_px: int) -> Dn:

@@ -9,6 +9,7 @@ import pytest
 from typer import Typer
 
 import hilstar
+from hilstar.basics.errors import InputError
 from hilstar.cli.app import application, run
 from tests.support.benches import ROOT
 
@@ -39,6 +40,21 @@ def test_help_is_there(words, flag, capsys):
     usage = next(line for line in capsys.readouterr().out.splitlines() if "Usage:" in line)
     typed = usage.partition(" [OPTIONS]")[0].split()
     assert typed[len(typed) - len(words) :] == words
+
+
+@pytest.mark.parametrize("words", LINES, ids=" ".join)
+def test_an_option_says_what_its_value_is(words, capsys):
+    """Not of which type it is; a limit that nobody meets is no help either."""
+    assert not run([*words, "--help"])
+    shown = capsys.readouterr().out
+    options = shown.partition("─ Options ─")[2]
+    for word in ("range>", "<int", "<float", "<str", "<path", "INTEGER", "FLOAT", "9223372"):
+        assert word not in options
+
+
+def test_a_seed_that_no_file_can_hold_is_refused():
+    with pytest.raises(InputError, match=f"--seed {2**63}: write 0 to {2**63 - 1}"):
+        run(["simulate", "bench.toml", "--radec", "0,0,0", "--seed", str(2**63)])
 
 
 def test_the_version_is_the_package_s(capsys):

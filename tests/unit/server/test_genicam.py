@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import ipaddress
 import json
-import threading
 import time
 
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.basics.errors import InputError, MachineError
-from hilstar.basics.notices import Notices
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.genicam import camera as cameras
 from hilstar.server.genicam.camera import (
@@ -23,10 +18,9 @@ from hilstar.server.genicam.camera import (
     list_cameras,
 )
 from hilstar.server.genicam.pixels import unpacked
-from hilstar.server.gige.camera import GigECamera
-from hilstar.server.gige.registers import CameraIdentity, CameraSettings
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import run_hilstar
+from tests.support.gige_cameras import fake_camera, running_camera
 from tests.support.gige_client import own_address
 
 needs_aravis = pytest.mark.skipif(
@@ -85,29 +79,6 @@ def test_without_aravis_it_says_what_to_install(monkeypatch):
         GenicamCamera("")
 
 
-@contextlib.contextmanager
-def running_camera():
-    """The virtual camera, whose images count up."""
-    address, stop = own_address(), threading.Event()
-    identity = CameraIdentity(ipaddress.IPv4Address(address), "virtual tracker", "1", address[-12:])
-    settings = CameraSettings(64, 48, 12, 0.01, 50.0)
-
-    def feed() -> None:
-        k = 0
-        while not stop.wait(0.02):
-            k += 1
-            camera.take(np.full((48, 64), k % 4096, np.uint16), time.monotonic_ns())
-
-    with GigECamera(identity, settings, AllowedSenders(), Notices()) as camera:
-        thread = threading.Thread(target=feed)
-        thread.start()
-        try:
-            yield address
-        finally:
-            stop.set()
-            thread.join()
-
-
 @needs_aravis
 def test_a_camera_is_listed_set_and_read_in_every_format_it_has():
     with running_camera() as address:
@@ -117,11 +88,51 @@ def test_a_camera_is_listed_set_and_read_in_every_format_it_has():
             newest = 0
             for form in camera.about["formats"]:
                 camera.set({"PixelFormat": form})
-                image = camera.grab(0.01)
+                image = camera.grab(0.01).dn
                 assert image.shape == (48, 64) and image.min() == image.max()
                 if form != "Mono8":
                     assert image[0, 0] > newest
                     newest = int(image[0, 0])
+
+
+@needs_aravis
+def test_an_image_has_the_time_at_which_its_exposure_began():
+    with running_camera() as address, GenicamCamera(address) as camera:
+        before_ns = time.time_ns()
+        image = camera.grab(0.25)
+        after_ns = time.time_ns()
+    assert image.exposure_s == 0.25 and image.incomplete == 0 and image.bayer == ""
+    # The virtual camera of this test exposes nothing: its image comes at once.
+    assert before_ns <= image.begun_utc_ns + 250_000_000 <= after_ns
+
+
+# Aravis's fake camera has these beside RGB8.
+FAKE_FORMATS = {
+    "Mono8": "",
+    "Mono16": "",
+    "BayerRG8": "RGGB",
+    "BayerGR8": "GRBG",
+    "BayerGB8": "GBRG",
+    "BayerBG8": "BGGR",
+}
+
+
+@needs_aravis
+def test_a_fake_camera_of_others_gives_its_images_in_each_of_its_formats():
+    with fake_camera() as address, GenicamCamera(address) as camera:
+        assert set(camera.about["formats"]) == {*FAKE_FORMATS, "RGB8"}
+        for form, mosaic in FAKE_FORMATS.items():
+            camera.set({"PixelFormat": form})
+            image = camera.grab(0.01)
+            assert image.dn.shape == (512, 512) and image.bayer == mosaic
+            if form.startswith("Mono"):
+                # its grey test pattern is a ramp along the diagonal
+                upper = (image.dn >> (8 if form == "Mono16" else 0)).astype(int)
+                np.testing.assert_array_equal(upper[1:, :-1], upper[:-1, 1:])
+                assert np.ptp(upper) > 200
+        camera.set({"PixelFormat": "RGB8"})
+        with pytest.raises(InputError, match="sends RGB8; write a pixel_format of grey"):
+            camera.grab(0.01)
 
 
 @needs_aravis

@@ -330,7 +330,9 @@ def test_what_is_no_image_is_refused_in_one_line(tmp_path: Path) -> None:
         done = run_hilstar_here("confront", bench, tmp_path / name, "-o", tmp_path / "out")
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
         assert says in done.stderr
-    done = run_hilstar_here("confront", bench, RAW[0], "-o", tmp_path / "out", "--at", "yesterday")
+    done = run_hilstar_here(
+        "confront", bench, RAW[0], "-o", tmp_path / "out", "--taken", "yesterday"
+    )
     assert done.returncode == 2
     assert "write one such as" in done.stderr
 
@@ -343,7 +345,7 @@ def test_a_date_that_is_ten_years_off_is_told_by_a_fast_star(tmp_path: Path) -> 
     bench = write_bench(tmp_path / "guess.toml")
     for year, off in (("2010", 10.0), ("2020", 0.0)):
         found = confronted(
-            bench, [tmp_path / "cygnus.png"], tmp_path / year, "--at", f"{year}-01-01T00:00:00"
+            bench, [tmp_path / "cygnus.png"], tmp_path / year, "--taken", f"{year}-01-01T00:00:00"
         )
         image_figures = found["images"][0]
         assert image_figures["date_off_years"] == pytest.approx(
@@ -392,7 +394,7 @@ def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path)
         write_bench(tmp_path / "guess.toml", more=keys),
         [tmp_path / "pass.png"],
         tmp_path / "out",
-        "--at",
+        "--taken",
         utc,
     )
     trails = [

@@ -13,7 +13,7 @@ import pytest
 
 from hilstar.server.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
 from hilstar.server.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
-from hilstar.server.record.report import (
+from hilstar.server.record.run_figures import (
     BLOCK,
     MAX_EVENTS,
     RunFigures,

@@ -83,7 +83,10 @@ def write_page(path: Path, found: Assessment) -> None:
     cards = [_budget(found), _answers(found), *_events(found), *_pictured(found)]
     parts = [figures_of(_counts(found)), *(card.html() for card in cards)]
     parts.append(side_by_side([_bias(found), _pixel(found)]))
-    parts.append(side_by_side([_clock(found), _beside(found)]))
+    beside = [_clock(found), _beside(found)]
+    if found.cube is not None:
+        beside.append(Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)]))
+    parts.append(side_by_side(beside))
     parts += [card.html() for card in _slices(found)]
     parts.append(_all_figures(found))
     if found.notes:

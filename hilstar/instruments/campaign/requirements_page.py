@@ -47,6 +47,7 @@ from hilstar.instruments.campaign.requirements import (
 )
 from hilstar.instruments.campaign.results import VARY, Columns, read_cases
 from hilstar.instruments.campaign.store import file_sha256
+from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.certificate_file import bench_certificate, off_by
 
@@ -126,6 +127,9 @@ def write_requirements(
         ("program", f"hilstar {__version__}"),
         *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
+    cube = cube_to_boresight(file, certificate)
+    if cube is not None:
+        about.append(("cube to boresight", cube.line))
     parts = [_verdicts(verdicts).html(), _error_card(figure).html()]
     parts.append(Card("Campaign", words=[key_table(about)]).html())
     names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)

@@ -16,7 +16,7 @@ no parameter costs.
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +64,14 @@ MAX_REASONS = 5
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns (n,) by name: numbers as float64 with NaN where there are none, and text. `cases`
-    counts the whole table's.
+    """Columns (n,) by name: numbers as float64 with NaN where there are none, text, and lists of
+    numbers (k,). `cases` counts the whole table's.
     """
 
     cases: int
     numbers: dict[str, FloatArray]
     texts: dict[str, list[str]]
+    lists: dict[str, list[FloatArray]] = field(default_factory=dict)
 
     @property
     def varied(self) -> list[str]:
@@ -84,7 +85,11 @@ class Columns:
             name: [text for text, is_one in zip(column, chosen, strict=True) if is_one]
             for name, column in self.texts.items()
         }
-        return Columns(self.cases, numbers, texts)
+        lists = {
+            name: [values for values, is_one in zip(column, chosen, strict=True) if is_one]
+            for name, column in self.lists.items()
+        }
+        return Columns(self.cases, numbers, texts, lists)
 
     def vectors(self, form: str, names: str) -> FloatArray:
         """Columns (n, k) side by side: `form` with each of `names` in it."""
@@ -98,6 +103,7 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
 
     numbers: dict[str, list[FloatArray]] = {}
     texts: dict[str, list[str]] = {}
+    lists: dict[str, list[FloatArray]] = {}
     try:
         file = pq.ParquetFile(path)
         step = -(-file.metadata.num_rows // max_cases) or 1
@@ -108,6 +114,10 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
                 column: Any = table.column(name)
                 if pa.types.is_string(column.type):
                     texts.setdefault(name, []).extend(value or "" for value in column.to_pylist())
+                elif pa.types.is_list(column.type):
+                    lists.setdefault(name, []).extend(
+                        np.array(values or [], dtype=np.float64) for values in column.to_pylist()
+                    )
                 else:
                     values = np.array(
                         [np.nan if v is None else float(v) for v in column.to_pylist()]
@@ -117,6 +127,7 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
             file.metadata.num_rows,
             {name: np.concatenate(parts) for name, parts in numbers.items()},
             texts,
+            lists,
         )
     except (OSError, pa.ArrowException, ValueError) as error:
         raise InputError(

@@ -26,6 +26,7 @@ from hilstar.instruments.certify.budget import (
 from hilstar.instruments.certify.check import take_check
 from hilstar.instruments.certify.model import THIRDS, true_deviations
 from hilstar.instruments.certify.readings import Reader
+from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.certificate_file import (
     KIND,
@@ -164,6 +165,7 @@ def certify(
         reference_sha256=None if reference is None else sha256_of(reference),
         replaces=replaces,
     )
+    certificate = msgspec.structs.replace(certificate, cube=cube_to_boresight(file, certificate))
     return certificate, reference
 
 

@@ -118,6 +118,8 @@ def _value(figure: CertifiedFigure) -> str:
 def _cards(found: Certificate, digest: str) -> Iterator[Card]:
     yield _figures(found)
     yield Card("Certificate", words=[key_table(_heads(found, digest))])
+    if found.cube is not None:
+        yield Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)])
     yield _budget(found)
     yield Card("First order against trials", words=list(_both_ways(found)))
     yield Card("Not assessed", words=[list_of(found.not_assessed)])
@@ -333,6 +335,8 @@ def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str,
             value = f"{round(widest.value, places) + 0.0:+.{places}f}"
             text = f"{value} +- {half:.{places}f} {widest.unit} (the worst of {len(members)})"
             lines.append((f"{quantity} {region or ''}".strip(), text))
+    if found.cube is not None:
+        lines.append(("cube to boresight", found.cube.line))
     lines += [("not assessed", widest) for widest in found.not_assessed]
     return [
         *lines,

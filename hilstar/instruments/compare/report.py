@@ -154,11 +154,12 @@ class ChartPanel:
     def draw(self, axis: "Axes") -> None:
         """Draw the stars, the limits and the legend."""
         for kind, marker, colour in STYLES:
-            mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
+            points = [self.point(star) for star in self.of(kind)]
+            mags = [mag for mag, _, _ in points]
             if kind in self.rows:
                 heights = [self.rows[kind]] * len(mags)
             else:
-                heights = errors
+                heights = [error for _, error, _ in points]
             axis.plot(
                 mags,
                 heights,

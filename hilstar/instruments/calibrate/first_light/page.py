@@ -76,16 +76,15 @@ def _bench_file(session: SessionFile, before: Path) -> Card:
 
 
 def _verdict(records: list[StepRecord]) -> Verdict:
-    by = {
-        verdict: [record.name for record in records if record.verdict == verdict]
-        for verdict in WORDS
-    }
-    passed = f"{len(by['done'])} of {len(records)} steps passed"
+    names: dict[str, list[str]] = {verdict: [] for verdict in WORDS}
+    for record in records:
+        names[record.verdict].append(record.name)
+    passed = f"{len(names['done'])} of {len(records)} steps passed"
     missed = ""
-    if by["skipped"]:
-        missed = f"; not measured: {', '.join(by['skipped'])}"
-    if by["failed"]:
-        headline = f"Not ready: {', '.join(by['failed'])} failed"
+    if names["skipped"]:
+        missed = f"; not measured: {', '.join(names['skipped'])}"
+    if names["failed"]:
+        headline = f"Not ready: {', '.join(names['failed'])} failed"
         return Verdict(BAD, headline, f"{passed}{missed}. Each card says what to do.")
     if missed or len(records) < len(STEPS):
         return Verdict(WARN, "What was measured is in order", f"{passed}{missed}.")

@@ -403,12 +403,9 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     number = re.fullmatch(r"HIP (\d{1,9})", wanted)
     if number is not None:
         return np.flatnonzero(stars.hip == int(number[1]))
-    hip = next(
-        (hip for hip, names in star_names().items() if wanted in (names.name, names.designation)),
-        None,
-    )
-    if hip is not None:
-        return np.flatnonzero(stars.hip == hip)
+    for hip, names in star_names().items():
+        if wanted in (names.name, names.designation):
+            return np.flatnonzero(stars.hip == hip)
     identifier = stars.catalog.identifier_of(wanted)
     if identifier is None:
         return np.empty(0, dtype=np.intp)

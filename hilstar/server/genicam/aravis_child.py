@@ -3,16 +3,19 @@
     aravis_child.py list         print the cameras, as a JSON list
     aravis_child.py grab NAME    open a camera and print a line of JSON about it; then one for each
                                  line read: {"exposure_us": ..., "file": ...} for
-                                 an image, {"set": {...}} for features
+                                 an image, {"film": ..., "rows": ...} too for many,
+                                 {"set": {...}} for features
 
 NAME is a serial number, VENDOR-MODEL, an address or Aravis's own identifier; "" is the only camera.
-An image's bytes go to `file`, as the camera sent them. It imports nothing of hilstar, and needs
+An image's bytes go to `file`, as the camera sent them; of a film those of the wanted rows of one
+image after the other. It imports nothing of hilstar, and needs
 Debian's gir1.2-aravis-0.8 and python3-gi.
 """
 
 import json
 import re
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +25,9 @@ gi.require_version("Aravis", "0.8")
 from gi.repository import Aravis, GLib  # noqa: E402
 
 ADDRESS = re.compile(r"\d+(?:\.\d+){3}")
-BUFFERS = 4
+BUFFERS, FILM_BUFFERS = 4, 40
 MAX_TAKEN = 8  # frames for one image: incomplete ones are taken again
+NOTHING_CAME = "no image came; look at the camera's link, its trigger and a firewall"
 PATIENCE_US = 5_000_000  # beside the exposure
 
 
@@ -109,22 +113,12 @@ class Camera:
 
     def take(self, exposure_us: float, path: Path) -> dict[str, Any]:
         """Expose once after now, and write the image's bytes."""
-        self.camera.set_exposure_time(exposure_us)
-        payload = self.camera.get_payload()
-        stream = self.camera.create_stream(None, None)
-        for _ in range(BUFFERS):
-            stream.push_buffer(Aravis.Buffer.new_allocate(payload))
-        self.camera.start_acquisition()
+        stream = self._started(exposure_us, BUFFERS)
         try:
             buffer, taken = self._complete(stream, exposure_us)
         finally:
             self.camera.stop_acquisition()
-        pad_bytes, _ = buffer.get_image_padding()
-        if pad_bytes:
-            raise LookupError(
-                f"each line of its image ends with {pad_bytes} bytes of padding; set another Width"
-            )
-        path.write_bytes(buffer.get_image_data())
+        path.write_bytes(data_of(buffer))
         return {
             "format": self.camera.get_pixel_format_as_string(),
             "width": buffer.get_image_width(),
@@ -134,6 +128,55 @@ class Camera:
             "incomplete": taken - 1,
         }
 
+    def film(
+        self, exposure_us: float, path: Path, seconds: float, rows: list[int] | None
+    ) -> dict[str, Any]:
+        """Expose again and again for some time, and write the rows from the first to before the
+        last of each image, of all by default. `frames` has each one's time by the camera and its
+        arrival, ns.
+        """
+        stream = self._started(exposure_us, FILM_BUFFERS)
+        frames: list[tuple[int, int]] = []
+        incomplete = 0
+        size = (0, 0)
+        end_s = time.monotonic() + seconds
+        try:
+            with path.open("wb") as output:
+                while time.monotonic() < end_s:
+                    buffer = stream.timeout_pop_buffer(int(2 * exposure_us) + PATIENCE_US)
+                    if buffer is None:
+                        raise LookupError(NOTHING_CAME)
+                    if buffer.get_status() == Aravis.BufferStatus.SUCCESS:
+                        data = data_of(buffer)
+                        size = buffer.get_image_width(), buffer.get_image_height()
+                        row_bytes = len(data) // size[1]
+                        first, last = rows or (0, size[1])
+                        output.write(data[first * row_bytes : last * row_bytes])
+                        frames.append((buffer.get_timestamp(), buffer.get_system_timestamp()))
+                    else:
+                        incomplete += 1
+                    stream.push_buffer(buffer)
+        finally:
+            self.camera.stop_acquisition()
+        return {
+            "format": self.camera.get_pixel_format_as_string(),
+            "width": size[0],
+            "height": size[1],
+            "exposure_us": self.camera.get_exposure_time(),
+            "frames": frames,
+            "incomplete": incomplete,
+        }
+
+    def _started(self, exposure_us: float, buffers: int) -> Any:
+        """The stream of an acquisition with an exposure."""
+        self.camera.set_exposure_time(exposure_us)
+        payload = self.camera.get_payload()
+        stream = self.camera.create_stream(None, None)
+        for _ in range(buffers):
+            stream.push_buffer(Aravis.Buffer.new_allocate(payload))
+        self.camera.start_acquisition()
+        return stream
+
     def _complete(self, stream: Any, exposure_us: float) -> tuple[Any, int]:
         """The first complete buffer, and how many there were up to it."""
         triggered = self._is_triggered()
@@ -142,9 +185,7 @@ class Camera:
                 self.camera.software_trigger()
             buffer = stream.timeout_pop_buffer(int(2 * exposure_us) + PATIENCE_US)
             if buffer is None:
-                raise LookupError(
-                    "no image came; look at the camera's link, its trigger and a firewall"
-                )
+                raise LookupError(NOTHING_CAME)
             if buffer.get_status() == Aravis.BufferStatus.SUCCESS:
                 return buffer, taken
             stream.push_buffer(buffer)
@@ -161,6 +202,17 @@ class Camera:
         return mode == "On"
 
 
+def data_of(buffer: Any) -> bytes:
+    """The bytes of an image. Raises LookupError for lines that are padded."""
+    pad_bytes, _ = buffer.get_image_padding()
+    if pad_bytes:
+        raise LookupError(
+            f"each line of its image ends with {pad_bytes} bytes of padding; set another Width"
+        )
+    data: bytes = buffer.get_image_data()
+    return data
+
+
 def serve(name: str) -> None:
     """Open a camera, say what it is, and do what each line asks."""
     camera = Camera(chosen(name))
@@ -171,6 +223,9 @@ def serve(name: str) -> None:
             if "set" in asked:
                 camera.adjust(asked["set"])
                 say({})
+            elif "film" in asked:
+                path = Path(asked["file"])
+                say(camera.film(asked["exposure_us"], path, asked["film"], asked["rows"]))
             else:
                 say(camera.take(asked["exposure_us"], Path(asked["file"])))
         except (LookupError, GLib.Error) as error:

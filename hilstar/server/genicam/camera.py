@@ -76,6 +76,21 @@ class CameraImage:
     incomplete: int
 
 
+@dataclass(frozen=True, slots=True)
+class Film:
+    """Images of a camera that exposes again and again: DN (n, rows, columns) in their order.
+
+    `stamp_ns` (n,) are their times by the camera's clock, and `arrived_utc_ns` (n,) when their
+    first bytes came. `incomplete` ones are not among them.
+    """
+
+    dn: npt.NDArray[np.unsignedinteger]
+    stamp_ns: npt.NDArray[np.int64]
+    arrived_utc_ns: npt.NDArray[np.int64]
+    exposure_s: float
+    incomplete: int
+
+
 class CameraError(MachineError):
     """What a camera answers to a request that it refuses."""
 
@@ -117,8 +132,8 @@ class GenicamCamera(Closing):
         except CameraError as error:
             raise InputError(f"[tracker.camera]: {error}") from error
 
-    def _awaited(self) -> dict[str, Any]:
-        end_s = time.monotonic() + OPEN_TIMEOUT_S
+    def _awaited(self, seconds: float = OPEN_TIMEOUT_S) -> dict[str, Any]:
+        end_s = time.monotonic() + seconds
         while (answer := self._answer()) is None:
             self._check_time(end_s, "does not answer")
             time.sleep(0.01)
@@ -167,6 +182,41 @@ class GenicamCamera(Closing):
         while (image := self.image()) is None:
             time.sleep(0.002)
         return image
+
+    def film(self, exposure_s: float, seconds: float, rows: tuple[int, int] | None = None) -> Film:
+        """Images of `seconds`; of each the rows from the first to before the last, or all.
+
+        The pixel format is one of whole bytes a pixel. They lie in a file until the next image.
+        Raises MachineError, InputError.
+        """
+        exposure_us = exposure_s * 1e6
+        self._ask(
+            {"exposure_us": exposure_us, "file": str(self._file), "film": seconds, "rows": rows}
+        )
+        answer = self._awaited(seconds + GRAB_TIMEOUT_S)
+        self._check_exposure(exposure_us, answer["exposure_us"])
+        match = FORMAT.fullmatch(answer["format"])
+        if match is None or match[3]:
+            raise InputError(
+                self._said(
+                    f"films in {answer['format']}; write [tracker.camera] pixel_format of whole"
+                    ' bytes, such as "Mono8"'
+                )
+            )
+        count = len(answer["frames"])
+        if not count:
+            raise MachineError(self._said("gave no whole image; look at its link"))
+        first, last = rows or (0, answer["height"])
+        kind = np.dtype(np.uint8 if match[2] == "8" else "<u2")
+        shape = count, last - first, answer["width"]
+        stamp_ns, arrived_ns = np.array(answer["frames"], dtype=np.int64).T
+        return Film(
+            np.memmap(self._file, dtype=kind, mode="r", shape=shape),
+            stamp_ns,
+            arrived_ns,
+            answer["exposure_us"] / 1e6,
+            answer["incomplete"],
+        )
 
     def _check_exposure(self, asked_us: float, exposure_us: float) -> None:
         off_us = abs(exposure_us - asked_us)

@@ -1,20 +1,10 @@
-"""Takes a camera's images by Aravis, for a parent: run by the system's Python, which alone has it.
+"""Takes a camera's images by Aravis, for a parent (see `child_lines`): run by the system's Python,
+which alone has it.
 
-    aravis_child.py list         print the cameras, as a JSON list
-    aravis_child.py grab NAME    open a camera and print a line of JSON about it; then one for each
-                                 line read: {"exposure_us": ..., "file": ...} for
-                                 an image, {"film": ..., "rows": ...} too for many,
-                                 {"set": {...}} for features
-
-NAME is a serial number, VENDOR-MODEL, an address or Aravis's own identifier; "" is the only camera.
-An image's bytes go to `file`, as the camera sent them; of a film those of the wanted rows of one
-image after the other. It imports nothing of hilstar, and needs
-Debian's gir1.2-aravis-0.8 and python3-gi.
+It imports nothing of hilstar, and needs Debian's gir1.2-aravis-0.8 and python3-gi.
 """
 
-import json
 import re
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -22,13 +12,20 @@ from typing import Any
 import gi
 
 gi.require_version("Aravis", "0.8")
+from child_lines import (  # noqa: E402
+    MAX_TAKEN,
+    NEVER_WHOLE,
+    NOTHING_CAME,
+    PATIENCE_S,
+    chosen,
+    main,
+    refuse_format,
+    refuse_padding,
+)
 from gi.repository import Aravis, GLib  # noqa: E402
 
 ADDRESS = re.compile(r"\d+(?:\.\d+){3}")
 BUFFERS, FILM_BUFFERS = 4, 40
-MAX_TAKEN = 8  # frames for one image: incomplete ones are taken again
-NOTHING_CAME = "no image came; look at the camera's link, its trigger and a firewall"
-PATIENCE_US = 5_000_000  # beside the exposure
 
 
 def cameras() -> list[dict[str, str]]:
@@ -47,34 +44,12 @@ def cameras() -> list[dict[str, str]]:
     ]
 
 
-def names_of(camera: dict[str, str]) -> set[str]:
-    """The names by which a camera is meant."""
-    return {
-        camera["id"],
-        camera["serial"],
-        camera["address"],
-        f"{camera['vendor']}-{camera['model']}",
-    }
+class AravisCamera:
+    """An open camera (see `child_lines.OpenCamera`)."""
 
-
-def chosen(name: str) -> str:
-    """The identifier to open. Raises LookupError."""
-    if ADDRESS.fullmatch(name):
-        return name  # asked at its own address: no list is needed
-    seen = cameras()
-    fitting = [camera["id"] for camera in seen if not name or name in names_of(camera)]
-    if len(fitting) == 1:
-        return fitting[0]
-    listed = ", ".join(f"{camera['id']} ({camera['address']})" for camera in seen) or "none"
-    if not seen:
-        raise LookupError("no camera is there; write its address, such as genicam:192.168.1.10")
-    raise LookupError(f"genicam:{name} fits {len(fitting)} of the cameras here: {listed}")
-
-
-class Camera:
-    """An open camera."""
-
-    def __init__(self, identifier: str) -> None:
+    def __init__(self, name: str) -> None:
+        # asked at its own address: no list is needed
+        identifier = name if ADDRESS.fullmatch(name) else chosen(name, cameras())
         self.camera = Aravis.Camera.new(identifier)
         self.device = self.camera.get_device()
         # The exposure is who asks's own, and so is the light of an image.
@@ -84,14 +59,10 @@ class Camera:
             self.camera.set_gain_auto(Aravis.Auto.OFF)
 
     def adjust(self, features: dict[str, Any]) -> None:
-        """Set features by their names, the pixel format first."""
+        """Set features by their names."""
         for name, value in features.items():
             if name == "PixelFormat":
-                formats = self.camera.dup_available_pixel_formats_as_strings()
-                if value not in formats:
-                    raise LookupError(
-                        f"the camera has no PixelFormat {value}; it has {', '.join(formats)}"
-                    )
+                refuse_format(value, self.camera.dup_available_pixel_formats_as_strings())
             if isinstance(value, bool):
                 self.device.set_boolean_feature_value(name, value)
             elif isinstance(value, int):
@@ -131,10 +102,7 @@ class Camera:
     def film(
         self, exposure_us: float, path: Path, seconds: float, rows: list[int] | None
     ) -> dict[str, Any]:
-        """Expose again and again for some time, and write the rows from the first to before the
-        last of each image, of all by default. `frames` has each one's time by the camera and its
-        arrival, ns.
-        """
+        """Expose again and again for some time, and write rows of each image."""
         stream = self._started(exposure_us, FILM_BUFFERS)
         frames: list[tuple[int, int]] = []
         incomplete = 0
@@ -143,7 +111,7 @@ class Camera:
         try:
             with path.open("wb") as output:
                 while time.monotonic() < end_s:
-                    buffer = stream.timeout_pop_buffer(int(2 * exposure_us) + PATIENCE_US)
+                    buffer = stream.timeout_pop_buffer(patience_us(exposure_us))
                     if buffer is None:
                         raise LookupError(NOTHING_CAME)
                     if buffer.get_status() == Aravis.BufferStatus.SUCCESS:
@@ -183,16 +151,13 @@ class Camera:
         for taken in range(1, MAX_TAKEN + 1):
             if triggered:
                 self.camera.software_trigger()
-            buffer = stream.timeout_pop_buffer(int(2 * exposure_us) + PATIENCE_US)
+            buffer = stream.timeout_pop_buffer(patience_us(exposure_us))
             if buffer is None:
                 raise LookupError(NOTHING_CAME)
             if buffer.get_status() == Aravis.BufferStatus.SUCCESS:
                 return buffer, taken
             stream.push_buffer(buffer)
-        raise LookupError(
-            f"{MAX_TAKEN} images in a row came incomplete; look at the link, or a smaller packet"
-            " size"
-        )
+        raise LookupError(NEVER_WHOLE)
 
     def _is_triggered(self) -> bool:
         try:
@@ -202,56 +167,17 @@ class Camera:
         return mode == "On"
 
 
+def patience_us(exposure_us: float) -> int:
+    """How long an image may take."""
+    return int(2 * exposure_us + PATIENCE_S * 1e6)
+
+
 def data_of(buffer: Any) -> bytes:
     """The bytes of an image. Raises LookupError for lines that are padded."""
-    pad_bytes, _ = buffer.get_image_padding()
-    if pad_bytes:
-        raise LookupError(
-            f"each line of its image ends with {pad_bytes} bytes of padding; set another Width"
-        )
+    refuse_padding(buffer.get_image_padding()[0])
     data: bytes = buffer.get_image_data()
     return data
 
 
-def serve(name: str) -> None:
-    """Open a camera, say what it is, and do what each line asks."""
-    camera = Camera(chosen(name))
-    say(camera.about())
-    for line in sys.stdin:
-        asked = json.loads(line)
-        try:
-            if "set" in asked:
-                camera.adjust(asked["set"])
-                say({})
-            elif "film" in asked:
-                path = Path(asked["file"])
-                say(camera.film(asked["exposure_us"], path, asked["film"], asked["rows"]))
-            else:
-                say(camera.take(asked["exposure_us"], Path(asked["file"])))
-        except (LookupError, GLib.Error) as error:
-            say({"error": words_of(error)})
-
-
-def words_of(error: Exception) -> str:
-    """What an error says."""
-    return str(getattr(error, "message", "") or error.args[0])
-
-
-def say(answer: object) -> None:
-    """A line for the parent."""
-    print(json.dumps(answer), flush=True)
-
-
-def main() -> None:
-    """Do what the command line asks."""
-    if sys.argv[1] == "list":
-        say(cameras())
-        return
-    try:
-        serve(sys.argv[2])
-    except (LookupError, GLib.Error) as error:
-        say({"error": words_of(error)})
-
-
 if __name__ == "__main__":
-    main()
+    main(cameras, AravisCamera, (LookupError, GLib.Error))

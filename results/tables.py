@@ -497,7 +497,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry", "lost")
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel")
 
 
 def beside_table(name: str) -> str:

@@ -497,7 +497,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel")
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "stellarium")
 
 
 def beside_table(name: str) -> str:

@@ -16,7 +16,7 @@ COMMANDS = {
     "Show stars": ("demo", "frame", "serve", "replay"),
     "Attitude streams": ("send", "attitude", "convert", "answers", "fmu", "keys"),
     "Check what is shown": ("simulate", "verify", "compare", "budget", "catalogue", "report"),
-    "Test the tracker": ("assess", "campaign", "tracker", "confront"),
+    "Test the tracker": ("accept", "assess", "campaign", "tracker", "confront"),
     "Calibrate": ("first_light", "latency", "certify"),
     "Study": ("study", "benchmark"),
     "This machine": ("doctor",),
@@ -37,7 +37,7 @@ GROUPS = {
     "calibrate": (
         "Calibrate",
         CALIBRATE,
-        ("dots", "geometric", "psf", "alignment", "plan", "photometric", "scale"),
+        ("dots", "geometric", "psf", "alignment", "reference", "plan", "photometric", "scale"),
     ),
     "sensor": ("Calibrate", SENSOR, ("import_", "measure")),
     "optics": ("Calibrate", OPTICS, ("map_", "lens", "zernike")),

@@ -134,13 +134,16 @@ def with_its_figures(file: "benches.BenchFile", name: str) -> "benches.BenchFile
     """The bench with another sensor, and a line about where its figures are from."""
     from hilstar.basics.reading import parse_toml
     from hilstar.server.bench.bench_file import changed_file
-    from hilstar.server.bench.config.sensor import lacking, other_sensor
+    from hilstar.server.bench.config.sensor import lacking, named_keys, other_sensor
     from hilstar.tracker.sensors import sensor_named
 
-    tables, kept = other_sensor(parse_toml(file.path, file.text), name)
-    changed = changed_file(file, tables)
+    other = other_sensor(parse_toml(file.path, file.text), name)
+    changed = changed_file(file, other.tables)
     sensor = sensor_named(name, "--sensor")
     say(f"{sensor.name}: {sensor.source}")
-    if kept:
-        say(f"its sheet has no {lacking(sensor, kept)}: the bench's stand")
+    if other.kept:
+        beside = f", with {named_keys(other.beside)}" if other.beside else ""
+        say(f"its sheet has no {lacking(sensor, other.kept)}: the bench's stand{beside}")
+    if other.dropped:
+        say(f"left out, as they are the old sensor's: {named_keys(other.dropped)}")
     return changed

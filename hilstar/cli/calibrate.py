@@ -20,6 +20,7 @@ from hilstar.basics.files import (
     make_directory,
     refuse_stdout,
 )
+from hilstar.cli.image_source import Exposure, Grab, ShownTo, dot_images
 from hilstar.cli.options import (
     BenchFile,
     Json,
@@ -72,7 +73,6 @@ def dots(
     """
     import numpy as np
 
-    from hilstar.instruments.calibrate.geometric.calibration import seen_screen_of
     from hilstar.instruments.calibrate.geometric.dots import (
         dot_image,
         lit_for,
@@ -80,6 +80,7 @@ def dots(
         show_dots,
         write_plan,
     )
+    from hilstar.instruments.calibrate.geometric.geometry_fit import seen_screen_of
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.frame_files import write_codes_png
 
@@ -117,17 +118,21 @@ def dots(
 
 def geometric(
     bench_file: BenchFile,
-    observed: Annotated[
-        list[Path],
-        Argument(
-            metavar="OBSERVED...",
-            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.",
-        ),
-    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
     output: Annotated[
         Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
     ],
+    observed: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="OBSERVED...",
+            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images; none with --grab.",
+        ),
+    ] = None,
+    grab: Grab = None,
+    exposure: Exposure = None,
+    feed: ShownTo = None,
+    overwrite: Overwrite = False,
     tracker_is_ideal: Annotated[
         bool,
         Option(
@@ -136,7 +141,11 @@ def geometric(
         ),
     ] = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="A dark frame, taken from each image; with --grab one is taken, too.",
+        ),
     ] = None,
     plot: Annotated[
         Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")
@@ -146,7 +155,7 @@ def geometric(
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker
     saw.
     """
-    from hilstar.instruments.calibrate.geometric.calibration import (
+    from hilstar.instruments.calibrate.geometric.geometry_fit import (
         calibrate_files,
         lines_of,
         summary_of,
@@ -157,10 +166,12 @@ def geometric(
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
-    check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
+    check_files([*(observed or []), dark, plan / "plan.csv"], [output, plot], file)
+    taken = dot_images(file, observed or [], plan, grab, exposure, feed, overwrite)
+    dark = dark or taken.dark
     with busy("fitting the geometry"):
         calibration = calibrate_files(
-            file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
+            file, taken.images, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
         )
     monitor = file.config.monitor
     written = write_calibrated(
@@ -175,16 +186,25 @@ def geometric(
 
 def psf(
     bench_file: BenchFile,
-    images: Annotated[
-        list[Path], Argument(metavar="IMAGES...", help="The tracker's images of the dots.")
-    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
     output: Annotated[
         Path,
         Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf."),
     ],
+    images: Annotated[
+        list[Path] | None,
+        Argument(metavar="IMAGES...", help="The tracker's images of the dots; none with --grab."),
+    ] = None,
+    grab: Grab = None,
+    exposure: Exposure = None,
+    feed: ShownTo = None,
+    overwrite: Overwrite = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="A dark frame, taken from each image; with --grab one is taken, too.",
+        ),
     ] = None,
     oversampling: Annotated[
         int, Option(metavar="N", help="Samples a tracker pixel along each axis.", min=2, max=16)
@@ -207,9 +227,11 @@ def psf(
     check_ending("-o", output, FITS)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
-    check_files([*images, dark, plan / "plan.csv"], [output, plot], file)
+    check_files([*(images or []), dark, plan / "plan.csv"], [output, plot], file)
+    taken = dot_images(file, images or [], plan, grab, exposure, feed, overwrite)
+    dark = dark or taken.dark
     with busy("finding the PSFs"):
-        psf_result = effective_psf(file, images, plan / "plan.csv", dark, oversampling)
+        psf_result = effective_psf(file, taken.images, plan / "plan.csv", dark, oversampling)
     write_glass(output, psf_result.glass)
     if plot is not None:
         draw_effective(plot, psf_result)
@@ -546,3 +568,62 @@ def scale(
             f"flux_at_white_dof = {len(found.ratios) - 1}",
         ]
     print_found(as_json, summary, lines)
+
+
+def reference(
+    readings: Annotated[
+        Path,
+        Argument(
+            metavar="READINGS.csv",
+            help=(
+                "target,azimuth_deg,elevation_deg[,station][,sigma_arcsec][,x_px,y_px]: faces of"
+                " the cube (+x, -y, ...), lit dots (dot), and links between stations (docs:"
+                " Calibration files)."
+            ),
+        ),
+    ],
+    bench_file: Annotated[
+        Path | None,
+        Option("--bench", metavar="BENCH.toml", help="The bench, for dots by their pixels."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        Option("-o", "--output", metavar="FILE.toml", help="Write the table [alignment] here."),
+    ] = None,
+    name: Annotated[str, Option(metavar="TEXT", help="What the reference is.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Find how the display stands to the tracker's cube from a theodolite's readings: the table
+    [alignment] of the bench file.
+    """
+    import datetime
+
+    from hilstar.basics.files import write_whole
+    from hilstar.instruments.calibrate.reference import (
+        fit_reference,
+        lines_of,
+        read_readings,
+        summary_of,
+        toml_of,
+    )
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.cameras import bench_camera
+
+    check_ending("-o", output, TOML)
+    camera = None
+    file = None
+    if bench_file is not None:
+        file = read_bench_file(bench_file)
+        camera = bench_camera(file.config, file.folder)
+    check_files([readings, bench_file], [output], file)
+    found = fit_reference(readings, read_readings(readings, camera))
+    table = toml_of(found, name, datetime.datetime.now(datetime.UTC).date().isoformat())
+    written = []
+    if output is not None:
+        write_whole(output, table)
+        written.append(str(output))
+    print_found(
+        as_json,
+        summary_of(found) | {"written": written},
+        [*lines_of(found), "in the bench file:", *table.splitlines()],
+    )

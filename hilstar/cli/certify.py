@@ -12,7 +12,7 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory, write_whole
 from hilstar.basics.reading import exists
-from hilstar.cli.image_source import image_source, virtual_truth
+from hilstar.cli.image_source import ShownTo, handed_on, image_source, virtual_truth
 from hilstar.cli.options import BenchFile, Json, check_files, seed_option
 from hilstar.server.console.terminal import busy, print_found, say
 
@@ -41,10 +41,10 @@ def certify(
     grab: Annotated[
         str | None,
         Option(
-            metavar="CMD",
+            metavar="CMD|genicam:NAME",
             help=(
                 "Command that takes the tracker's image, as that of first-light ({output},"
-                " {pattern})."
+                " {pattern}), or a camera."
             ),
         ),
     ] = None,
@@ -85,6 +85,7 @@ def certify(
             help="Watch white for up to so long, until it is stable.",
         ),
     ] = 0.0,
+    feed: ShownTo = None,
     quick: Annotated[
         bool, Option("--quick", help="Few trials: first order is enough where the model is linear.")
     ] = False,
@@ -108,6 +109,7 @@ def certify(
         ("--whole", whole or None),
         ("--dark", dark),
         ("--diode", diode),
+        ("--feed", feed),
     ):
         if given is not None and (virtual is not None) != (name == "--whole"):
             raise InputError(
@@ -128,6 +130,7 @@ def certify(
             whole,
             dark,
             diode,
+            feed,
             seed,
             check,
             again,
@@ -152,7 +155,7 @@ def _certify(
     from hilstar.instruments.certify.certificate import certify as certified
     from hilstar.instruments.certify.check import largest_changes, watch
     from hilstar.instruments.certify.page import text_lines, write_certificate_page
-    from hilstar.server.bench.certificate import read_certificate
+    from hilstar.server.bench.certificate_file import read_certificate
 
     path = output / CERTIFICATE
     replaces = None
@@ -203,7 +206,7 @@ def _check(
         take_check,
         watch,
     )
-    from hilstar.server.bench.certificate import read_certificate
+    from hilstar.server.bench.certificate_file import read_certificate
 
     reference = read_reference(output / REFERENCE)
     since = "the bench file"
@@ -253,6 +256,7 @@ def _reader(
     whole: bool,
     dark: Path | None,
     diode: str | None,
+    feed: str | None,
     seed: int,
     check: bool,
     again: bool,
@@ -271,6 +275,7 @@ def _reader(
     if truth is not None and not whole:
         return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
     source = ended.enter_context(closing(image_source(file, grab, virtual, dark, diode, seed)))
+    ended.enter_context(handed_on(feed, source))
     source.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
     source.gate(file)
     folder = ended.enter_context(temporary_folder("certify"))

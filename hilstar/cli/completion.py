@@ -1,6 +1,7 @@
 """Values that Tab offers for an option, where they are a closed set.
 
-What brings a set is imported only once Tab asks for it.
+What brings a set is imported only once Tab asks for it. A set that only one command offers stands
+beside that command.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,13 +17,6 @@ def offered(words: Iterable[str] | Callable[[], Iterable[str]]) -> Offer:
         return [word for word in known if word.startswith(incomplete)]
 
     return complete
-
-
-def steps() -> Iterable[str]:
-    """The steps of first light."""
-    from hilstar.instruments.calibrate.first_light.session import NAMES
-
-    return NAMES
 
 
 def centroiders() -> Iterable[str]:
@@ -44,10 +38,3 @@ def stars() -> Iterable[str]:
     from hilstar.sky.catalog import star_names
 
     return (star.name for star in star_names().values() if star.name and " " not in star.name)
-
-
-def commands() -> Iterable[str]:
-    """The commands and groups."""
-    from hilstar.cli.app import names
-
-    return names()

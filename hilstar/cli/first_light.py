@@ -1,6 +1,6 @@
 """hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,8 +12,8 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.completion import offered, steps
-from hilstar.cli.image_source import image_source, virtual_truth
+from hilstar.cli.completion import offered
+from hilstar.cli.image_source import handed_on, image_source, virtual_truth
 from hilstar.cli.options import (
     BenchFile,
     Json,
@@ -24,12 +24,19 @@ from hilstar.cli.running import Console, ConsoleName, Control, Feed, Force, Toke
 from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern
+    from hilstar.instruments.calibrate.first_light.image_sources import Pattern
     from hilstar.server.bench import bench_file as files
     from hilstar.server.console.listener import PageListener
 
 PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
 MAX_AVERAGE = 1000  # images that verify averages
+
+
+def steps() -> Iterable[str]:
+    """The steps that --again takes."""
+    from hilstar.instruments.calibrate.first_light.session import NAMES
+
+    return NAMES
 
 
 def first_light(
@@ -40,7 +47,7 @@ def first_light(
             "-o",
             "--output",
             metavar="SESSION",
-            help="Directory of the session; an older one is gone on with.",
+            help="Directory of the session; an existing session is resumed.",
         ),
     ],
     grab: Annotated[
@@ -172,7 +179,7 @@ def first_light(
     with (
         page_listener(console, control, token, console_name) as listener,
         closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
-        _handed_on(feed, source),
+        handed_on(feed, source),
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -224,18 +231,3 @@ def _shown(
             feed.say(line)
 
         yield tell, feed.show
-
-
-@contextmanager
-def _handed_on(endpoint: str | None, source: "ImageSource") -> Iterator[None]:
-    """The session's patterns handed on at an endpoint, if there is one. Raises InputError."""
-    if endpoint is None:
-        yield
-        return
-    from hilstar.attitude.wire.shown_frames import FrameSender
-    from hilstar.instruments.calibrate.first_light.image_sources import PatternFrames
-
-    with FrameSender(endpoint) as sender:
-        source.hand_on(PatternFrames(sender))
-        say(f"frames: {sender.endpoint}")
-        yield

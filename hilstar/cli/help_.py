@@ -1,10 +1,18 @@
 """hilstar help: the help of a command."""
 
+from collections.abc import Iterable
 from typing import Annotated
 
 from typer import Argument
 
-from hilstar.cli.completion import commands, offered
+from hilstar.cli.completion import offered
+
+
+def commands() -> Iterable[str]:
+    """The commands and groups."""
+    from hilstar.cli.app import names
+
+    return names()
 
 
 def help_(

@@ -22,7 +22,7 @@ def report(
     and memory.
     """
     from hilstar.server.console.report import report as write_report
-    from hilstar.server.record.report import table_rows
+    from hilstar.server.record.run_figures import table_rows
 
     check_directory("-o", output)
     with busy("reading the run"):

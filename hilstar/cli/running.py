@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hilstar.server.operator import SwitchRequests
     from hilstar.server.pacer import FrameSink, Shown
     from hilstar.server.record.ledger import LedgerSwitch
-    from hilstar.server.serve import Follower, Running
+    from hilstar.server.run_progress import Follower, Running
     from hilstar.server.summary import RunSummary
     from hilstar.server.sync import BeatSummary
 
@@ -140,9 +140,9 @@ def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] 
     """Explain the attitudes' source, that of the stars, the choices within the tolerance, and
     bodies that are discs then.
     """
-    from hilstar.optics.layers.diffuse import DiffuseLayer
+    from hilstar.optics.layers.diffuse_layer import DiffuseLayer
     from hilstar.server.bench.effort_report import effort_lines
-    from hilstar.server.bench.moving import observer_lines, satellite_lines, wide_bodies
+    from hilstar.server.bench.moving_sky import observer_lines, satellite_lines, wide_bodies
 
     moving = bench.moving
     for line in [

@@ -170,11 +170,11 @@ class FaultView:
                 raise InputError(f"file = {fault.file!r}: {advice}")
             else:
                 values = read_map(self._folder / fault.file)
+                # The fault states the light of the brightest pixel, else the map's own is meant.
                 if fault.electrons_per_s is not None or fault.electrons is not None:
                     values = values / values.max()
-                image = map_image(
-                    values, fault, camera, by.tracker if fault.frame == "tracker" else by.monitor
-                )
+                of_its_frame = by.tracker if fault.frame == "tracker" else by.monitor
+                image = map_image(values, fault, camera, of_its_frame)
             known = extended.LightMap(image, times=self.light_e_per_s(fault), bv_mag=fault.bv_mag)
         with self._lock:
             self._maps.pop(fault, None)
@@ -326,17 +326,18 @@ class FaultView:
         self, now: Sequence[Now], q_icrs_to_cam: FloatArray
     ) -> list[extended.ExtendedLight]:
         """The stray light of the faults that are on."""
-        found: list[extended.ExtendedLight] = []
+        surfaces: list[extended.ExtendedLight] = []
         for active in now:
             fault = active.fault
             if isinstance(fault, Glow):
-                found.append(self._glow(fault, active.share, q_icrs_to_cam))
+                surfaces.append(self._glow(fault, active.share, q_icrs_to_cam))
             elif isinstance(fault, Gradient | MeasuredMap):
                 light = self._map(fault)
-                found.append(
-                    light if active.share == 1 else replace(light, times=light.times * active.share)
-                )
-        return found
+                # the same object, by which the renderer recognises the same light
+                if active.share != 1:
+                    light = replace(light, times=light.times * active.share)
+                surfaces.append(light)
+        return surfaces
 
     def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.GlowLight:
         fixed = fault.tracker_px is not None or fault.screen_px is not None

@@ -38,18 +38,18 @@ from hilstar.instruments.calibrate.first_light.stars import (
     noise_words,
     place_reasons,
 )
-from hilstar.instruments.calibrate.geometric.calibration import (
-    calibrate_seen,
-    nominal_of,
-    rough_geometry,
-    seen_screen_of,
-)
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,
     SeenScreen,
     joined,
     lit_for,
     plan_seen_dots,
+)
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
+    calibrate_seen,
+    nominal_of,
+    rough_geometry,
+    seen_screen_of,
 )
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.instruments.calibrate.scale import StarReading, scale_of

@@ -53,7 +53,7 @@ def first_light(
     grab: Annotated[
         str | None,
         Option(
-            metavar="CMD",
+            metavar="CMD|genicam:NAME",
             help=(
                 "Command that takes the tracker's image: {output} is the file to write; {pattern},"
                 " where the command shows"

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
@@ -41,8 +41,12 @@ from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import BenchFile, dated, stated_in
 from hilstar.server.bench.scenario import Scenario, read_scenario
+from hilstar.server.bench.star_light import bench_moving
 
-ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
+ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1, "body": 3}
 MAX_STEP_S = 0.01  # of a turn that accelerates
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
@@ -55,6 +59,7 @@ ON_BENCH = (
     "acceleration_deg_s2",
     "time_s",
     "scenario",
+    "body_deg",
 )
 Kind = Literal["int64", "float64", "bool", "text", "floats"]
 
@@ -177,7 +182,10 @@ class CaseMaker:
             if name
         ]
         self._scenarios = {name: read_scenario(folder / name) for name in named}
+        self._skies: dict[str, MovingSky | None] = {}
         _check_through(plan, self.parameters, file)
+        if plan.attitudes.body is not None:  # so that a body that is not there is refused here
+            self.case(0, np.full(self.attitude_dimensions + len(self.parameters), 0.5))
 
     @property
     def attitude_dimensions(self) -> int:
@@ -280,7 +288,33 @@ class CaseMaker:
                 t_ns,
             )
         t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
-        return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
+        if self.plan.attitudes.body is None:
+            q = looking_q(self.plan.attitudes, look)
+        else:
+            q = self._beside_body(self.plan.attitudes, look, values, t_ns)
+        return View.exposure(q, rate_rad_s, 0.0, t_ns)
+
+    def _beside_body(
+        self, attitudes: Attitudes, look: FloatArray, values: dict[str, Any], t_ns: int
+    ) -> FloatArray:
+        """`q_icrs_to_cam` (4,) at the case's angle from a body, on any side of it. Raises
+        InputError where the bench has no such body.
+        """
+        file = changed_bench(self.file, self._tables, values)
+        if file.sha256 not in self._skies:
+            self._skies = {file.sha256: bench_moving(file.config, file.folder)}
+        moving = self._skies[file.sha256]
+        discs = [] if moving is None else moving.discs(np.eye(3)[2], math.pi, t_ns=t_ns)
+        disc = next((disc for disc in discs if disc.name.lower() == attitudes.body), None)
+        if disc is None:
+            raise InputError(
+                f'[attitudes] body = "{attitudes.body}": the bench has none; write [sky] epoch_utc'
+                f" and [sky.bodies] {attitudes.body} = true, or vary sky.bodies.{attitudes.body}"
+            )
+        off_rad = math.radians(float(values.get("body_deg", 0.0)))
+        low_deg, high_deg = attitudes.roll_deg
+        roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
+        return beside_q(disc.direction, off_rad, 2 * math.pi * float(look[0]), roll_deg)
 
 
 def accelerated(
@@ -309,11 +343,18 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
             360 * float(look[0]), math.degrees(math.asin(2 * float(look[1]) - 1)), roll_deg
         )
     off = math.acos(1 - float(look[1]) * (1 - math.cos(math.radians(attitudes.radius_deg))))
-    angle = 2 * math.pi * float(look[0])
     ra, dec = (math.radians(degrees) for degrees in attitudes.radec_deg)
+    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    return beside_q(middle, off, 2 * math.pi * float(look[0]), roll_deg)
+
+
+def beside_q(middle: FloatArray, off: float, angle: float, roll_deg: float) -> FloatArray:
+    """`q_icrs_to_cam` (4,) with the boresight `off` (rad) from an ICRS direction (3,), at a
+    position angle (rad) from north to east.
+    """
+    ra, dec = math.atan2(middle[1], middle[0]), math.asin(max(-1.0, min(1.0, float(middle[2]))))
     east = np.array([-math.sin(ra), math.cos(ra), 0.0])
     north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
-    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
     x, y, z = math.cos(off) * middle + math.sin(off) * (
         math.sin(angle) * east + math.cos(angle) * north
     )

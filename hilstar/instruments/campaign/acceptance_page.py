@@ -39,7 +39,7 @@ from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import SIGN, SIGN_STYLE, STATES
 from hilstar.instruments.campaign.store import file_sha256
-from hilstar.instruments.campaign.sweep import levels_text
+from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, levels_text
 from hilstar.server.bench.certificate import off_by
 
 PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
@@ -203,6 +203,10 @@ def _measured(each: ClauseVerdict) -> str:
     verdict = each.verdict
     if verdict is None or verdict.value is None:
         return DASH
+    if each.clause.quantity == "edge" and None in (verdict.low, verdict.high):
+        for end in (STILL, NOT_EVEN):
+            if end in verdict.method:
+                return f"{end} {_digits(verdict.value)} {each.unit}".rstrip()
     low, high = (_digits(end) for end in (verdict.low, verdict.high))
     return f"{_digits(verdict.value)} ({low} to {high}) {each.unit}".rstrip()
 

@@ -38,6 +38,7 @@ from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.simulate.batch import faulty_exposure, view_at
 from hilstar.instruments.simulate.simulator import FaultyExposure, Simulator
 from hilstar.optics.frame_motion import CameraTurn
+from hilstar.optics.layers.fault_kinds import Fault, fault_of
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import BenchFile, dated, stated_in
 from hilstar.server.bench.scenario import Scenario, read_scenario
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1, "body": 3}
 MAX_STEP_S = 0.01  # of a turn that accelerates
+STRAY, STRAY_DEG, STRAY_FROM_S = "stray_e_per_px", 80.0, -1e5
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
 # what varies on a real bench
@@ -257,8 +259,15 @@ class CaseMaker:
         return 0 if self._log is None else self._log.span_ns[0]
 
     def scenario(self, case: Case) -> Scenario | None:
-        """The case's scenario."""
-        return self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        """The case's scenario, its stray light among the faults."""
+        scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        stray_e = float(case.values.get(STRAY, 0.0))
+        if stray_e <= 0:
+            return scenario
+        glow = stray_light(stray_e, self.file)
+        if scenario is None:
+            return Scenario(Path(), "", case.noise_seed, (glow,))
+        return dataclasses.replace(scenario, faults=(*scenario.faults, glow))
 
     def fault_end_s(self, case: Case, length_s: float) -> float | None:
         """When the last fault of the case's scenario ends, after the case's begin; None outside
@@ -363,6 +372,15 @@ def beside_q(middle: FloatArray, off: float, angle: float, roll_deg: float) -> F
     )
 
 
+def stray_light(electrons: float, file: BenchFile) -> Fault:
+    """Even light over the tracker's detector: a glow that is far wider than any field."""
+    width, height = file.config.tracker.resolution_px
+    middle = [(width - 1) / 2, (height - 1) / 2]
+    table = {"name": "stray light", "kind": "glow", "scale_deg": STRAY_DEG, "tracker_px": middle}
+    # on before the first exposure begins, half of which is before the case's begin
+    return fault_of(table | {"electrons": electrons, "at_s": STRAY_FROM_S})
+
+
 def _read_log(path: Path, file: BenchFile) -> _Log:
     read = open_log(path, stated_in(file.config))
     max_rate_rad_s = math.radians(file.config.attitude.max_rate_deg_s)
@@ -407,7 +425,7 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             raise InputError(
                 '[[vary]] key = "time_s": with a log the times are the log\'s; leave it out'
             )
-        if plan.through == "display" and parameter.key == SCENARIO:
+        if plan.through == "display" and parameter.key in (SCENARIO, STRAY):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": faults are of through = "tracker"; write that'
             )

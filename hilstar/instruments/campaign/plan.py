@@ -58,13 +58,14 @@ OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
-    *("time_s", "noise_seed", "scenario", "body_deg"),
+    *("time_s", "noise_seed", "scenario", "body_deg", "stray_e_per_px"),
 )
 MAX_OWN = {
     "rate_deg_s": 360.0,
     "acceleration_deg_s2": 360.0,
     "misalignment_arcsec": 36_000.0,
     "body_deg": 180.0,
+    "stray_e_per_px": 1e9,
     "time_s": 9e9,
     "noise_seed": 2.0**63 - 1,
 }

@@ -24,6 +24,7 @@ from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, clo
 from hilstar.instruments.campaign.plan import Number
 from hilstar.instruments.campaign.results import Columns
 
+STILL, NOT_EVEN = "still answers at", "does not even answer at"
 ENDS = 2  # levels before the first middle
 LEVEL_CONFIDENCE = 0.95  # by which levels are chosen, whatever the clauses' own
 SAME_WIDTH = 1e-9  # gaps that differ by less are equally wide
@@ -157,10 +158,10 @@ def edge_figure(sweep: SweepTable, counts: list[LevelCount], confidence: float) 
     method = f"bisection over {len(counts)} levels, Clopper-Pearson at each"
     if not math.isfinite(good):
         value = sweep.start
-        method += "; it does not even answer at the start"
+        method += f"; {NOT_EVEN} the start"
     elif not math.isfinite(bad):
         value = sweep.stop
-        method += "; it still answers at the stop"
+        method += f"; {STILL} the stop"
     else:
         value = sweep.between(sense * good, sense * bad)
     return BoundedFigure(value, ends[0], ends[1], cases, method)

@@ -20,6 +20,7 @@ from hilstar.instruments.campaign.cases import CaseMaker
 from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, parse_plan
 from hilstar.instruments.campaign.session import Session
+from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
@@ -254,3 +255,21 @@ def test_a_case_that_speeds_up_turns_as_its_rate_says(tmp_path: Path) -> None:
     off_arcsec = np.degrees((found * (turn * first).inv()).magnitude()) * 3600
     # midpoints of 10 ms against those of 1 ms: a step of rate 1 deg/s is off by under 1e-9 deg
     assert off_arcsec < 1e-3
+
+
+def test_stray_light_is_even_and_in_every_exposure(tmp_path: Path) -> None:
+    vary = {"key": "stray_e_per_px", "values": [0.0, 5000.0]}
+    write_campaign(tmp_path, vary, sampling="grid", cases=2, frames=2)
+    this = session(tmp_path)
+    where = Design("grid", 7, 2, 3, [2]).points(0, 2)
+    for number, wanted_e in ((0, 0.0), (1, 5000.0)):
+        case = this.maker.case(number, where[number])
+        tracker = this._at(this.maker.bench(case))
+        assert isinstance(tracker, Simulator)
+        for frame in range(2):
+            view = this.maker.view(case, frame, tracker.config.tracker.exposure_s)
+            exposure = tracker.expose(view, None, this.maker.faults(case, view, tracker))
+            corners_e = exposure.mean_e[[0, 0, -1, -1], [0, -1, 0, -1]]
+            # a glow of 80 degrees falls by 0.2 % to the corners, 3.4 degrees off
+            assert corners_e == pytest.approx(wanted_e, rel=0.005)
+    this.close()

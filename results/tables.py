@@ -6,6 +6,7 @@ timing.csv and those of colour by `hilstar study NAME -o`, quantisation_time.csv
 by `hilstar study quantisation -o`. machine.txt says on which machine; bench_h100.csv on an NVIDIA
 H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200. chain.csv and
 chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+rigs.csv is `hilstar study rigs -o DIR`, and no machine changes it.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
 beside_*.csv are `python tools/beside.py NAME -o DIR`, and no machine changes them.
@@ -501,7 +502,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry")
+BESIDE = ("galsim", "astrometry", "lost")
 
 
 def beside_table(name: str) -> str:
@@ -518,8 +519,28 @@ def beside_table(name: str) -> str:
 
 
 UNIT_WORDS = {"relative": "of it"}
+
+
+def rigs_table() -> str:
+    """What is published of rigs, what is predicted of it, and what hilstar's codes would leave."""
+
+    def cell(value: str, unit: str) -> str:
+        size = float(value)
+        return "" if math.isnan(size) else f"{size:.3g} {unit}"
+
+    body = []
+    for row in rows_of("rigs.csv"):
+        unit = row["unit"].split()[0].rstrip(",")
+        figures = [cell(row[name], unit) for name in ("published", "predicted", "difference")]
+        body.append([row["rig"], row["figure"], *figures, cell(row["with_hilstar"], unit)])
+    return table(
+        ["rig", "figure", "published", "predicted", "difference", "hilstar's codes there"], body
+    )
+
+
 TABLES = {
     **{f"beside_{name}": partial(beside_table, name) for name in BESIDE},
+    "rigs": rigs_table,
     "answers": answers_table,
     "certify": certify_table,
     "colour": colour_table,

@@ -21,6 +21,7 @@ from tests.support.beside.steps import write_beside
 PROGRAMS = {
     "galsim": "",
     "astrometry": "Debian's astrometry.net",
+    "lost": "UWCubeSat/lost, built, its folder as the environment's LOST",
 }
 
 

@@ -14,8 +14,9 @@ import math
 import re
 import tomllib
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS, PAGE, README = "claims.toml", "docs/claims.md", "README.md"
@@ -90,6 +91,26 @@ class Claim:
         return f"{self.value} {self.unit}".strip()
 
 
+@dataclass(frozen=True)
+class Table:
+    """A table that `results/tables.py` makes of `file`, and what its kind of figures is held
+    against.
+    """
+
+    name: str
+    what: str
+    file: str
+    oracle: str
+    against: str
+    test: str
+    shares: str
+    names: tuple[str, ...] = ()
+
+    def is_outside(self) -> bool:
+        """Whether something that is not hilstar's own holds it."""
+        return self.oracle in OUTSIDE
+
+
 def last_digit(words: str) -> float:
     """What one step of a number's last digit is: 0.01 of "1.25", 1e-13 of "8.1e-12"."""
     mantissa, _, exponent = words.replace(" ", "").partition("e")
@@ -98,23 +119,40 @@ def last_digit(words: str) -> float:
 
 
 def claims_of(root: Path = ROOT) -> list[Claim]:
-    """The rows of claims.toml.
+    """The figures of claims.toml.
 
     Raises:
         ValueError: a key is unknown or missing, or an identifier stands twice.
     """
-    with (root / ROWS).open("rb") as file:
-        tables = tomllib.load(file)["claim"]
-    claims = []
-    for table in tables:
-        try:
-            claims.append(Claim(**(table | {"names": tuple(table["names"])})))
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{ROWS}: {table.get('id')}: {error}") from None
+    claims = [Claim(**row) for row in rows_of("claim", Claim, root)]
     twice = [name for name, count in Counter(claim.id for claim in claims).items() if count > 1]
     if twice:
         raise ValueError(f"{ROWS}: {', '.join(twice)} stands twice")
     return claims
+
+
+def tables_of(root: Path = ROOT) -> list[Table]:
+    """The generated tables of claims.toml.
+
+    Raises:
+        ValueError: a key is unknown or missing.
+    """
+    return [Table(**row) for row in rows_of("table", Table, root)]
+
+
+def rows_of(kind: str, record: type[Claim] | type[Table], root: Path) -> list[dict[str, Any]]:
+    """The rows of a kind, with the keys that it has to have and no others."""
+    with (root / ROWS).open("rb") as file:
+        rows = tomllib.load(file).get(kind, [])
+    keys = {field.name: field.default is MISSING for field in fields(record)}
+    for row in rows:
+        unknown = set(row) - set(keys)
+        missing = {key for key, is_needed in keys.items() if is_needed} - set(row)
+        if unknown or missing:
+            name = row.get("id") or row.get("name")
+            words = ", ".join(sorted(unknown | missing))
+            raise ValueError(f"{ROWS}: {name}: unknown or missing: {words}")
+    return [row | {"names": tuple(row.get("names", ()))} for row in rows]
 
 
 def pages_of(root: Path = ROOT) -> dict[str, str]:
@@ -141,7 +179,7 @@ def sum_of(claims: list[Claim]) -> str:
 def page(root: Path = ROOT) -> str:
     """docs/claims.md: the sum, and a row a claim by group."""
     claims, pages = claims_of(root), pages_of(root)
-    places = {claim.id: pages_with(claim.id, pages) for claim in claims}
+    places_of = {claim.id: pages_with(claim.id, pages) for claim in claims}
     counts = Counter(claim.kind for claim in claims)
     others = ", ".join(f"{counts[kind]} {KINDS[kind]}" for kind in ("time", "setting"))
     lines = [
@@ -160,23 +198,40 @@ def page(root: Path = ROOT) -> str:
         lines += ["", f"## {group}", ""]
         lines += ["| figure | of | oracle | shared with hilstar | test | last | on |"]
         lines += ["|---|---|---|---|---|---|---|"]
-        lines += [line(claim, places[claim.id]) for claim in rows]
+        lines += [line(claim, places_of[claim.id]) for claim in rows]
+    lines += ["", "## Generated tables", ""]
+    lines += ["Their figures are those of the files (`tests/docs/test_generated.py`).", ""]
+    lines += ["| table | file | oracle | shared with hilstar | test |", "|---|---|---|---|---|"]
+    for table in tables_of(root):
+        places = [name for name, text in pages.items() if f"<!-- table: {table.name} -->" in text]
+        of = f"{table.what} ({', '.join(link(place) for place in places)})"
+        cells = [of, f"`{table.file}`", oracle_of(table), table.shares, test_of(table.test)]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def line(claim: Claim, places: list[str]) -> str:
     """A claim as a row of the table."""
     of = f"{claim.what}; {claim.conditions}" if claim.conditions else claim.what
-    against = " ".join(filter(None, [claim.against, claim.version]))
-    oracle = f"{claim.oracle}: {against}" if claim.against else claim.oracle
+    oracle = " ".join(filter(None, [oracle_of(claim), claim.version]))
     if claim.why:
         oracle += f" ({claim.why})"
-    path, _, name = claim.test.partition("::")
-    test = f"`{Path(path).name}::{name}`" if claim.test else "-"
     linked = ", ".join(link(place) for place in places)
     sense = "≤ " if claim.sense == AT_MOST and " to " not in claim.value else ""
-    cells = [f"{sense}{claim.figure()}", f"{of} ({linked})", oracle, claim.shares, test]
-    return f"| {' | '.join([*cells, str(claim.last), claim.date.isoformat()])} |"
+    cells = [f"{sense}{claim.figure()}", f"{of} ({linked})", oracle, claim.shares]
+    cells += [test_of(claim.test), str(claim.last), claim.date.isoformat()]
+    return f"| {' | '.join(cells)} |"
+
+
+def oracle_of(row: Claim | Table) -> str:
+    """The kind of oracle, and which."""
+    return f"{row.oracle}: {row.against}" if row.against else row.oracle
+
+
+def test_of(test: str) -> str:
+    """A test by its file and its name."""
+    path, _, name = test.partition("::")
+    return f"`{Path(path).name}::{name}`" if test else "-"
 
 
 def link(place: str) -> str:

@@ -35,7 +35,7 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 FIRST_ASKS = 8  # quickly, so that the clock is soon known
 QUICK_ASK_NS = NS_PER_S // 10
-ASK_NS = NS_PER_S // 2
+ASK_NS = NS_PER_S // 2  # after the FIRST_ASKS
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
 POLL_MS = 20
 MAX_PASSED_ON = 10

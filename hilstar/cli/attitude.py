@@ -8,7 +8,7 @@ from typer import Argument, Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
 from hilstar.cli import options
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
@@ -116,7 +116,9 @@ def _live(file: "BenchFile", time: str | None, patience_s: float) -> _Found:
                 f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar"
                 " serve --explain"
             )
-        return _Found(first_attitude(link, patience_s), link.conventions)
+        with busy(f"waiting for an attitude, {patience_s:g} s at most"):
+            sample = first_attitude(link, patience_s)
+        return _Found(sample, link.conventions)
 
 
 def _of_log(path: Path, time: str | None, stated: "Stated") -> _Found:

@@ -9,10 +9,11 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_directory, make_directory
+from hilstar.cli.completion import centroiders, offered, sensor_names
 from hilstar.cli.options import BenchFile, Json
 from hilstar.cli.pointing import RadecText, StarText, optional_attitude
 from hilstar.cli.running import say_optics
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.server.bench import bench_file as benches
@@ -28,6 +29,7 @@ def budget(
         str | None,
         Option(
             metavar="NAME",
+            autocompletion=offered(centroiders),
             help=(
                 "Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or"
                 " box5 (centres of mass), or "
@@ -49,6 +51,7 @@ def budget(
         Option(
             "--sensor",
             metavar="NAME",
+            autocompletion=offered(sensor_names),
             help="Whether this sensor (imx250, ...) behind the bench's lens is sensitive enough.",
         ),
     ] = None,
@@ -81,12 +84,13 @@ def budget(
         raise InputError(
             f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}"
         )
-    with load(bench_file) as bench:
+    with busy("finding the budget"), load(bench_file) as bench:
         fields = fields_of_view(bench.config, bench.file.folder)
         star_budget = find_budget(bench, by)
         assumed = shares_line(bench) or colour_line(bench)
     if output is not None:
-        write_report(make_directory(output), star_budget)
+        with busy("drawing the chart"):
+            write_report(make_directory(output), star_budget)
     print_found(as_json, star_budget, budget_lines(star_budget))
     say_optics(fields, star_budget.star)
     if assumed is not None:
@@ -118,9 +122,10 @@ def star_noise(
     attitude = optional_attitude("budget", radec, star, None, epoch_jyear)
     if sensor is not None:
         file = with_its_figures(file, sensor)
-    noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
-    if output is not None:
-        write_noise(make_directory(output), noise)
+    with busy("finding the noise"):
+        noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
+        if output is not None:
+            write_noise(make_directory(output), noise)
     answer = [] if sensor is None else [sensitivity_line(noise)]
     print_found(as_json, noise, [*answer, *noise_lines(noise)])
 

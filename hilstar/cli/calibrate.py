@@ -31,7 +31,7 @@ from hilstar.cli.options import (
     seed_option,
 )
 from hilstar.cli.running import Windowed
-from hilstar.server.console.terminal import print_found, print_json, say
+from hilstar.server.console.terminal import busy, print_found, print_json, say
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 NAMED = "in the bench file, under [collimator]: geometry = {!r}"
@@ -168,9 +168,11 @@ def geometric(
     file = read_bench_file(bench_file)
     check_files([*(observed or []), dark, plan / "plan.csv"], [output, plot], file)
     taken = dot_images(file, observed or [], plan, grab, exposure, feed, overwrite)
-    calibration = calibrate_files(
-        file, taken.images, plan / "plan.csv", dark or taken.dark, tracker_is_ideal=tracker_is_ideal
-    )
+    dark = dark or taken.dark
+    with busy("fitting the geometry"):
+        calibration = calibrate_files(
+            file, taken.images, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
+        )
     monitor = file.config.monitor
     written = write_calibrated(
         output, calibration, plot, _monitor_of(monitor.display, monitor.resolution_px)
@@ -227,9 +229,9 @@ def psf(
     file = read_bench_file(bench_file)
     check_files([*(images or []), dark, plan / "plan.csv"], [output, plot], file)
     taken = dot_images(file, images or [], plan, grab, exposure, feed, overwrite)
-    psf_result = effective_psf(
-        file, taken.images, plan / "plan.csv", dark or taken.dark, oversampling
-    )
+    dark = dark or taken.dark
+    with busy("finding the PSFs"):
+        psf_result = effective_psf(file, taken.images, plan / "plan.csv", dark, oversampling)
     write_glass(output, psf_result.glass)
     if plot is not None:
         draw_effective(plot, psf_result)
@@ -322,7 +324,8 @@ def alignment(
         )
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
-    aligned = align_files(file, pairs, ledger, offset_s or 0.0)
+    with busy("fitting the alignment"):
+        aligned = align_files(file, pairs, ledger, offset_s or 0.0)
     monitor = file.config.monitor
     write_alignment(output, aligned, file, _monitor_of(monitor.display, monitor.resolution_px))
     print_found(
@@ -458,9 +461,9 @@ def photometric(
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
     identity = _monitor_of(int(display) if display.isdecimal() else display)
-    found = calibrate_photometric(
-        measured, output, Provenance(who, when, instrument, unit), bits, identity
-    )
+    provenance = Provenance(who, when, instrument, unit)
+    with busy("fitting the response"):
+        found = calibrate_photometric(measured, output, provenance, bits, identity)
     if plot is not None:
         draw_calibration(measured, plot, bits)
         found["written"].append(str(plot))
@@ -565,3 +568,62 @@ def scale(
             f"flux_at_white_dof = {len(found.ratios) - 1}",
         ]
     print_found(as_json, summary, lines)
+
+
+def reference(
+    readings: Annotated[
+        Path,
+        Argument(
+            metavar="READINGS.csv",
+            help=(
+                "target,azimuth_deg,elevation_deg[,station][,sigma_arcsec][,x_px,y_px]: faces of"
+                " the cube (+x, -y, ...), lit dots (dot), and links between stations (docs:"
+                " Calibration files)."
+            ),
+        ),
+    ],
+    bench_file: Annotated[
+        Path | None,
+        Option("--bench", metavar="BENCH.toml", help="The bench, for dots by their pixels."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        Option("-o", "--output", metavar="FILE.toml", help="Write the table [alignment] here."),
+    ] = None,
+    name: Annotated[str, Option(metavar="TEXT", help="What the reference is.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Find how the display stands to the tracker's cube from a theodolite's readings: the table
+    [alignment] of the bench file.
+    """
+    import datetime
+
+    from hilstar.basics.files import write_whole
+    from hilstar.instruments.calibrate.reference import (
+        fit_reference,
+        lines_of,
+        read_readings,
+        summary_of,
+        toml_of,
+    )
+    from hilstar.server.bench.bench_file import read_bench_file
+    from hilstar.server.bench.cameras import bench_camera
+
+    check_ending("-o", output, TOML)
+    camera = None
+    file = None
+    if bench_file is not None:
+        file = read_bench_file(bench_file)
+        camera = bench_camera(file.config, file.folder)
+    check_files([readings, bench_file], [output], file)
+    found = fit_reference(readings, read_readings(readings, camera))
+    table = toml_of(found, name, datetime.datetime.now(datetime.UTC).date().isoformat())
+    written = []
+    if output is not None:
+        write_whole(output, table)
+        written.append(str(output))
+    print_found(
+        as_json,
+        summary_of(found) | {"written": written},
+        [*lines_of(found), "in the bench file:", *table.splitlines()],
+    )

@@ -14,7 +14,7 @@ from hilstar.basics.files import check_directory, make_directory, write_whole
 from hilstar.basics.reading import exists
 from hilstar.cli.image_source import ShownTo, handed_on, image_source, virtual_truth
 from hilstar.cli.options import BenchFile, Json, check_files, seed_option
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.instruments.certify.readings import Reader
@@ -172,9 +172,10 @@ def _certify(
         say(watched.line)
         warmed = None if watched.law == "none" else watched.bound
     checked = largest_changes(output)
-    certificate, reference = certified(
-        file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces
-    )
+    with busy("certifying"):
+        certificate, reference = certified(
+            file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces
+        )
     raw = msgspec.json.format(msgspec.json.encode(certificate))
     digest = sha256_of(raw)
     if reference is not None:

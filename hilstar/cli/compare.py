@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import Json
-from hilstar.server.console.terminal import print_json
+from hilstar.server.console.terminal import busy, print_json
 
 MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothing
 
@@ -47,11 +47,12 @@ def compare(
         FLUX_MAG if flux_mag is None else flux_mag,
         CENTROID_PX if centroid_px is None else centroid_px,
     )
-    comparison = compare_files(
-        frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth
-    )
-    if output is not None:
-        write_report(make_directory(output), comparison)
+    with busy("comparing"):
+        comparison = compare_files(
+            frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth
+        )
+        if output is not None:
+            write_report(make_directory(output), comparison)
     summary = comparison.summary()
     if as_json:
         print_json(summary)

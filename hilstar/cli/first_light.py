@@ -1,6 +1,6 @@
 """hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
+from hilstar.cli.completion import offered
 from hilstar.cli.image_source import handed_on, image_source, virtual_truth
 from hilstar.cli.options import (
     BenchFile,
@@ -31,6 +32,13 @@ PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
 MAX_AVERAGE = 1000  # images that verify averages
 
 
+def steps() -> Iterable[str]:
+    """The steps that --again takes."""
+    from hilstar.instruments.calibrate.first_light.session import NAMES
+
+    return NAMES
+
+
 def first_light(
     bench_file: BenchFile,
     output: Annotated[
@@ -39,7 +47,7 @@ def first_light(
             "-o",
             "--output",
             metavar="SESSION",
-            help="Directory of the session; an older one is gone on with.",
+            help="Directory of the session; an existing session is resumed.",
         ),
     ],
     grab: Annotated[
@@ -115,7 +123,12 @@ def first_light(
     ] = None,
     feed: Feed = None,
     again: Annotated[
-        list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")
+        list[str] | None,
+        Option(
+            metavar="STEP",
+            help="Do this step again; may be given often.",
+            autocompletion=offered(steps),
+        ),
     ] = None,
     seed: Annotated[int, seed_option("With --virtual: seed of the tracker's noise.")] = 0,
     force: Force = False,

@@ -10,7 +10,7 @@ from hilstar.basics.files import CSV, FITS, PNG, check_ending
 from hilstar.cli import options
 from hilstar.cli.pointing import QuaternionText, RadecText, StarText, attitude_of
 from hilstar.cli.running import explain_bench, explained_effort, optional_scenario, say_optics
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 NO_OUTPUT = (
     "frame: no output was asked for; add -o OUT.fits, --truth OUT.csv, --codes OUT.png or --explain"
@@ -62,7 +62,7 @@ def frame(
     file = at_moment(file, t_ns)
     options.check_files([scenario], targets, file)
     fields = fields_of_view(file.config, file.folder)
-    with open_bench(file) as bench:
+    with busy("drawing"), open_bench(file) as bench:
         if explain:
             explain_bench(bench, t_ns)
         effects = None

@@ -18,6 +18,7 @@ from typer import Argument, Option
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 from hilstar.basics.units import NS_PER_S
+from hilstar.cli.completion import offered
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
@@ -74,7 +75,15 @@ BodyName = Annotated[
     str | None, unsaid("--body", metavar="NAME", help="The body or frame, where a log has several.")
 ]
 REFERENCE_HELP = "The frame that attitudes refer to, or what its axes are: icrs, enu, ned."
-ReferenceName = Annotated[str | None, unsaid("--reference", metavar="FRAME", help=REFERENCE_HELP)]
+ReferenceName = Annotated[
+    str | None,
+    unsaid(
+        "--reference",
+        metavar="FRAME",
+        help=REFERENCE_HELP,
+        autocompletion=offered(("icrs", "enu", "ned")),
+    ),
+]
 EpochUtc = Annotated[
     str | None, unsaid("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.")
 ]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 from hilstar.basics.errors import InputError, shortened
+from hilstar.cli.completion import offered, stars
 from hilstar.cli.options import parse_numbers
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ StarText = Annotated[
     Option(
         "--star",
         metavar="NAME|HIP[,ROLL]",
+        autocompletion=offered(stars),
         help="Boresight at a star: its name (Vega, alpha Lyr) or Hipparcos number; roll 0 if none.",
     ),
 ]

@@ -9,6 +9,7 @@ from typer import Argument, Option
 from hilstar.basics.files import MCAP, check_directory, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.cli import options, running
+from hilstar.cli.completion import offered
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.server.console.terminal import say
 
@@ -20,7 +21,9 @@ def replay(
     speed: Annotated[
         str,
         Option(
-            metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time."
+            metavar="realtime|max|N",
+            help="Real time, as fast as possible, or N times real time.",
+            autocompletion=offered(("realtime", "max")),
         ),
     ] = "realtime",
     start: Annotated[

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hilstar.server.operator import SwitchRequests
     from hilstar.server.pacer import FrameSink, Shown
     from hilstar.server.record.ledger import LedgerSwitch
-    from hilstar.server.serve import Follower, Running
+    from hilstar.server.run_progress import Follower, Running
     from hilstar.server.summary import RunSummary
     from hilstar.server.sync import BeatSummary
 

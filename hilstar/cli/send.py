@@ -114,7 +114,9 @@ def send(
             Faults(lost, corrupted, reordered, jitter / 1000), np.random.default_rng(seed), link.put
         )
         say(f"waiting for a listener on {link.endpoint}")
-        if not heard(link, wait, stop):
+        with progress("waiting", wait) as waited:
+            is_heard = heard(link, wait, stop, waited)
+        if not is_heard:
             say("no listener yet; sending anyway")
         with progress("sending", min(total, count or math.inf)) as advance:
             send_samples(cable, islice(samples, count), stop, in_time(advance), sender)
@@ -191,10 +193,12 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
         say(f"{fields['statuses']} statuses heard, {fields['requests']} time requests answered")
 
 
-def heard(sender: Any, wait_s: float, stop: threading.Event) -> bool:
+def heard(sender: Any, wait_s: float, stop: threading.Event, waited: Callable[[int], None]) -> bool:
     """True once a receiver listens, and when stopped, which then ends the sending at once."""
-    deadline_s = time.monotonic() + wait_s
+    started_s = time.monotonic()
+    deadline_s = started_s + wait_s
     while not stop.is_set():
+        waited(round(time.monotonic() - started_s))
         if sender.wait_for_listener(min(LISTEN_SLICE_S, max(0.0, deadline_s - time.monotonic()))):
             return True
         if time.monotonic() >= deadline_s:

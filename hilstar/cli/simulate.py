@@ -12,7 +12,7 @@ from hilstar.basics.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_
 from hilstar.cli import options
 from hilstar.cli.pointing import QuaternionText, RadecText, StarText, attitude_of
 from hilstar.cli.running import optional_scenario, say_units_of
-from hilstar.server.console.terminal import print_found, progress, say
+from hilstar.server.console.terminal import busy, print_found, progress, say
 
 if TYPE_CHECKING:
     from hilstar.instruments.simulate.simulator import FrameNoise
@@ -95,7 +95,7 @@ def simulate(
         rate_rad_s = np.radians(options.parse_numbers(slew, 3, "--slew", "X,Y,Z in deg/s"))
     else:
         rate_rad_s = np.zeros(3)
-    with Simulator(file) as simulator:
+    with busy("exposing"), Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         view = simulator.view(q, rate_rad_s, t_ns)
         if wrong is None:

@@ -33,6 +33,7 @@ Study = Literal[
     "colour",
     "confront",
     "limits",
+    "rigs",
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file

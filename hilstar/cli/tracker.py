@@ -16,6 +16,7 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import is_command, stop_on_signal
 from hilstar.cli import options
+from hilstar.cli.completion import offered
 from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ def tracker(
         str | None,
         Option(
             metavar="truth|tetra3|CMD",
+            autocompletion=offered(("truth", "tetra3")),
             help=(
                 "Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve],"
                 " the default where it is"
@@ -89,7 +91,13 @@ def tracker(
         ),
     ] = None,
     form: Annotated[
-        str, Option("--format", metavar="packet|json", help="The format of the answers.")
+        str,
+        Option(
+            "--format",
+            metavar="packet|json",
+            help="The format of the answers.",
+            autocompletion=offered(("packet", "json")),
+        ),
     ] = "packet",
     connect: Annotated[
         bool,

@@ -392,7 +392,9 @@ KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
 
 
 def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYTES) -> str:
-    """The text of a file, whose bytes are added to those that were `read`."""
+    """The text of a file. Its bytes are appended to `read`, from which the calibration's hash is
+    made.
+    """
     raw = read_bytes(path, ADVICE, limit_bytes)
     if read is not None:
         read.append(raw)

@@ -21,8 +21,8 @@ from hilstar.display.identity import TABLE, MonitorIdentity
 from hilstar.optics.camera import Camera, Lens, ResidualField
 
 MAX_FILE_BYTES = 1_000_000
-MAX_TERMS = 21
-NORM_TOLERANCE = 1e-3
+MAX_TERMS = 21  # along each axis of [field]
+NORM_TOLERANCE = 1e-3  # of q_cam_to_mon as it is written, which is then normalised
 ADVICE = "give a file that `hilstar calibrate geometric` or `alignment` wrote"
 Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]

@@ -59,8 +59,9 @@ class ChannelMatrix:
     """`e_per_s` (channels, 3): electrons per second in each of `channels` by each primary of a
     pixel at full light.
 
-    By `condition` times as much as the channels' light can the primaries' be wrong, both relative;
-    None where two channels, or two primaries, have the same colour.
+    `condition` is the matrix's condition number: a relative error of the channels' light may be so
+    many times as large in the primaries' light. None where two channels, or two primaries, have the
+    same colour.
     """
 
     channels: tuple[str, ...]

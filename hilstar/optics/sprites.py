@@ -394,6 +394,7 @@ def extended_by_share(
     ]
     wide = shares_at(shares, stars, np.array(lights, dtype=np.intp))
     for place, (light, body) in enumerate(zip(sprites.extended, lights, strict=True)):
+        # light that is neither a star's nor a body's, as a fault's, has a colour of its own
         bv_mag = getattr(light, "bv_mag", None)
         if by_bv is not None and body < 0 and bv_mag is not None:
             wide[place] = shares_by_bv(by_bv, bv_mag)

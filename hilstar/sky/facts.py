@@ -82,8 +82,8 @@ def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
 
 
 def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
-    """Hipparcos' facts of a catalogue's stars (n,), but the errors of what is Hipparcos' own
-    alone, NaN for a table's stars.
+    """Hipparcos' facts of a catalogue's stars (n,). Their standard errors are those of Hipparcos'
+    own figures: NaN for the stars of a table, whose figures are not Hipparcos'.
     """
     facts = facts_of(catalog.hip)
     is_hipparcos = (catalog.identifier == catalog.hip) & (

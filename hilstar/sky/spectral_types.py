@@ -51,7 +51,7 @@ ANY_COLOUR = 0.3
 NOISE = 0.13
 LATE_SUBCLASS = (55.0, 65.0)
 LATE_EXTRA = 1.5
-TREND_DEGREE = 3
+TREND_DEGREE = 3  # of the polynomial in V-I that the rates' logarithms depart from
 BLOCK_STARS = 4000
 
 

@@ -32,7 +32,7 @@ from hilstar.basics.errors import InputError
 from hilstar.tracker.frame_noise import Word64Array, draw_blocks, normal_pairs, poisson
 from hilstar.tracker.settings import MAX_E, DetectorSettings, PixelPitch, check_value
 
-DEFAULT_PITCH_UM = 13.0
+DEFAULT_PITCH_UM = 13.0  # the CCD47-20's
 MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
 # A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a
@@ -40,7 +40,7 @@ MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 # alone, without Landau's tail.
 RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
-RAY_STEP_PX = 0.25
+RAY_STEP_PX = 0.25  # along a track, so that no pixel that it crosses is passed over
 
 FALSE_STAR_REACH_SIGMAS = 5.0
 CodeArray = npt.NDArray[np.uint16]

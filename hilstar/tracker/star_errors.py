@@ -25,12 +25,12 @@ from hilstar.tracker.centroiders import (
 
 # a pixel's width twice: a star is sampled by squares, and shown by squares
 SQUARES_VARIANCE = 1 / 6
-REACH_SIGMAS = 5.0
+REACH_SIGMAS = 5.0  # of a star, where it is looked at: beyond lie 6e-7 of a Gaussian
 BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centre
 # Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
-GOLDEN = 0.6180339887498949
+GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
 MIN_BLUR_PX = 1e-3
 
 

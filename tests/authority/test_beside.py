@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hilstar.basics.errors import MachineError
-from tests.support.beside import astrometry_side
+from tests.support.beside import astrometry_side, lost_side
 from tests.support.beside.steps import Beside
 
 # float32 shares are within MAX_SHARE_ERROR (1e-7) by polynomial, and 1.2e-7 of rounding
@@ -24,6 +24,10 @@ PLACES_ARCSEC = 1e-4
 IMAGE_ARCSEC = 1.0
 # of 2.6 px at the corner: k1's r^3 is all of order 3, but for the projection's own
 BENT_PX, FREE_PX = 2e-3, 0.1
+# LOST prints six digits: places are rounded evenly, and 364 of them tell their rms within 10 %
+DIGITS = 1.1
+# the Bright Star Catalogue's own errors, beside 0.32 arcsec of rounding
+CATALOGUE_ARCSEC = 1.0
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +89,16 @@ def test_astrometry_net_s_sip_follows_a_lens(astrometry):
     subject = "distortion of a lens, over the image"
     assert astrometry.size(subject, "without its SIP") > FREE_PX
     assert astrometry.size(subject, "hilstar's places, SIP of order 3") < BENT_PX
+
+
+def test_lost_s_generator_has_stars_where_hilstar_has_them():
+    """A fixed file of LOST's output, with its commit."""
+    places = lost_side.read_places(lost_side.FIXED)
+    lost = Beside("LOST", "", "", tuple(lost_side.place_steps(places)))
+    subject = lost_side.PLACES
+    assert len(places.hr) == 182
+    assert lost.size(subject, "by LOST's own") < DIGITS * lost.size(
+        subject, "for comparison: the six digits"
+    )
+    assert lost.size(subject, "and pixels from their centres") < CATALOGUE_ARCSEC
+    assert lost.size(subject, "as both come") > 1000 * CATALOGUE_ARCSEC  # its roll's sign

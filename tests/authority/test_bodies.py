@@ -88,6 +88,15 @@ def test_200_random_dates_agree_with_skyfield(rng, theirs):
     holds("body-places", 1000 * off_arcsec.max())
 
 
+def test_the_moon_moves_so_far_while_the_scale_of_time_is_29_seconds_off(rng, theirs):
+    """UTC is 37 s behind TAI since 2017, and was 8 s behind at the beginning of 1970."""
+    utcs = random_utcs_ns(rng, 200)
+    moon = ALL_BODIES.index("Moon")
+    there = in_skyfield(theirs, utcs)[:, moon]
+    later = in_skyfield(theirs, [utc + 29 * 10**9 for utc in utcs])[:, moon]
+    holds("moon-in-29-s", apart_arcsec(there, later).mean())
+
+
 # Astropy asks ERFA for leap seconds years after the last known one
 @pytest.mark.filterwarnings("ignore:ERFA function:erfa.ErfaWarning")
 def test_astropys_route_through_erfa_agrees(rng):

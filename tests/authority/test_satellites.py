@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from skyfield.api import EarthSatellite
 from skyfield.jpllib import SpiceKernel
 from skyfield.timelib import Time, Timescale
@@ -68,8 +69,8 @@ def test_places_of_a_week_agree_with_skyfield(observer, rng, theirs):
 
 
 # Skyfield's shadow is that of a sphere for the Sun's centre; half of the light is gone there within
-# the bend of the limb.
-SHADOW_LIMIT_S = 0.3
+# the bend of the limb. A change is looked for within this of a second of Skyfield's.
+SHADOW_WITHIN_S = 2.0
 
 
 def test_the_shadow_of_a_sphere_begins_and_ends_when_skyfield_says(theirs, monkeypatch):
@@ -84,13 +85,23 @@ def test_the_shadow_of_a_sphere_begins_and_ends_when_skyfield_says(theirs, monke
     sunlit = low.at(scale.tt_jd(date(scale, start).tt + seconds / 86_400)).is_sunlit(kernel)
     changes = np.flatnonzero(np.diff(sunlit.astype(int)))
     assert len(changes) >= 9
-    orbit, sky = TleOrbit(text, "low.tle"), moving_sky(start, ())
+    orbit, sky, off_s = TleOrbit(text, "low.tle"), moving_sky(start, ()), []
     for k in changes.tolist():
         sun_km = -sky.sight(round(seconds[k] * 1e9)).view.from_sun_km
 
         def share(second: float, sun_km: np.ndarray = sun_km) -> float:
             return float(sunlit_share(orbit.state(start + round(second * 1e9))[0][None], sun_km)[0])
 
-        before, after = share(seconds[k] - SHADOW_LIMIT_S), share(seconds[k + 1] + SHADOW_LIMIT_S)
-        assert (before > 0.5) == bool(sunlit[k])
-        assert (after > 0.5) == bool(sunlit[k + 1])
+        def is_lit(second: float) -> float:
+            when = scale.tt_jd(date(scale, start).tt + second / 86_400)
+            return float(low.at(when).is_sunlit(kernel)) - 0.5
+
+        ours_s = brentq(
+            lambda second: share(second) - 0.5,
+            seconds[k] - SHADOW_WITHIN_S,
+            seconds[k + 1] + SHADOW_WITHIN_S,
+        )
+        theirs_s = brentq(is_lit, seconds[k], seconds[k + 1], xtol=1e-3)
+        off_s.append(abs(ours_s - theirs_s))
+        assert (share(ours_s + SHADOW_WITHIN_S) > 0.5) == bool(sunlit[k + 1])
+    holds("shadow-time", max(off_s))

@@ -117,6 +117,8 @@ CALL = 'holds("star-places", error_mas.max())'
         ("claims.toml", 'value = "0.007"', 'value = "0.07"', "under half of 0.07 mas"),
         ("claims.toml", 'value = "0.007"', 'value = "0.005"', "out of"),
         ("claims.toml", "the catalogue; no code", "nothing", "hilstar imports astropy too"),
+        ("claims.toml", 'name = "limits"', 'name = "limit"', "no row of the table limits"),
+        ("claims.toml", '"FRAME_ARCSEC"', '"SPIN_ARCSEC"', "does not use SPIN_ARCSEC"),
         (TEST, CALL, "assert error_mas.max() < 1.0", "does not hand a value to holds"),
         (TEST, CALL, f"{CALL}\n    assert error_mas.max() < 1.0", "has a bound of its own"),
         (TEST, CALL, 'holds("star-places", 0.005)', "hands a constant to holds"),

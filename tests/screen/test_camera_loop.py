@@ -89,6 +89,13 @@ def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(scre
     focal_px = steps["geometry"]["figures"]["focal_length_px"]
     assert focal_px == pytest.approx(TRUE_FOCAL_MM * 1e3 / 57.65, rel=1e-3)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.1
+    # The twin agrees: of the true collimator the bench passes now, and did not before.
+    for file, code in ((tmp_path / "s" / "bench-before.toml", 1), (bench, 0)):
+        judged = tmp_path / f"judged-{code}.toml"
+        text = file.read_text()
+        judged.write_text(f"{text}\n[verify]\ntrue_focal_length_mm = {TRUE_FOCAL_MM}\n")
+        verified = run_hilstar("verify", judged, "--fields", "3", "--strict")
+        assert verified.returncode == code, (verified.stdout, verified.stderr)
 
 
 @needs_aravis

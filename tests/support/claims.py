@@ -28,9 +28,10 @@ from tools.claims import (
     OUTSIDE,
     ROWS,
     Claim,
+    Table,
     claims_of,
-    last_digit,
     pages_of,
+    tables_of,
 )
 
 RECORDS = "HILSTAR_CLAIMS"
@@ -41,6 +42,8 @@ FIGURE = re.compile(rf"(?<![\w.-])({NUMBER})\s(arcsec|mas|px|mag|%)(?![\w/])")
 NO_PROSE = re.compile(
     r"^```.*?^```$|<!-- table: \w+ -->.*?<!-- end -->|`[^`\n]*`", re.MULTILINE | re.DOTALL
 )
+LAST_ROUNDED = 0.005  # last values have three digits
+TABLE = re.compile(r"<!-- table: (\w+) -->")
 IMPORTED = re.compile(r"^ *(?:from|import) (\w+)", re.MULTILINE)
 
 
@@ -85,6 +88,7 @@ def faults(root: Path = ROOT) -> list[str]:
     for claim in claims:
         found += faults_of_row(claim)
         found += faults_of_test(claim, root, uses)
+    found += faults_of_tables(tables_of(root), pages, root)
     figures = [claim for claim in claims if claim.kind == "accuracy"]
     outside = sum(claim.is_outside() for claim in figures)
     if outside < MIN_OUTSIDE_SHARE * len(figures):
@@ -114,6 +118,31 @@ def faults_of_marks(claims: list[Claim], pages: dict[str, str]) -> list[str]:
     return found
 
 
+def faults_of_tables(tables: list[Table], pages: dict[str, str], root: Path) -> list[str]:
+    """Generated tables without a row, rows without a table, and rows whose test is not there or
+    does not use the oracle.
+    """
+    shown = {name for text in pages.values() for name in TABLE.findall(text)}
+    names = {table.name for table in tables}
+    found = [f"{ROWS}: no row of the table {name}" for name in sorted(shown - names)]
+    found += [f"{ROWS}: the table {name} is on no page" for name in sorted(names - shown)]
+    for table in tables:
+        place = f"{ROWS}: table {table.name}: {table.test}"
+        path, _, name = table.test.partition("::")
+        if not table.test and not table.is_outside():
+            continue
+        if not (root / path).is_file() or name not in definitions(root / path):
+            found.append(f"{place} does not exist")
+            continue
+        words = uses_of(root / path, name, root).words
+        unused = [word for word in table.names if not any(word in other for other in words)]
+        if unused:
+            found.append(f"{place} does not use {', '.join(unused)}")
+        if table.is_outside() and not (table.against and table.names):
+            found.append(f"{place}: nothing says what the test uses of the oracle")
+    return found
+
+
 def says(before: str, claim: Claim) -> bool:
     """Whether a text ends in a claim's figure, with its unit or without."""
     value = re.escape(claim.value)
@@ -140,7 +169,7 @@ def faults_of_row(claim: Claim) -> list[str]:
     low, high = claim.bound()
     lasts = claim.lasts()
     largest = max(lasts)
-    step = last_digit(f"{largest:.3g}") / 2
+    rounding = LAST_ROUNDED * abs(largest)
     limit = float(claim.value.split(" to ")[-1].replace(" ", ""))
     is_limit = claim.sense == AT_MOST and " to " not in claim.value
     rules = {
@@ -148,7 +177,7 @@ def faults_of_row(claim: Claim) -> list[str]:
         "the oracle is of no known kind": claim.oracle in (*INSIDE, *OUTSIDE),
         "the sense is neither 'at most' nor 'about'": claim.sense in (AT_MOST, ABOUT),
         f"the last value {claim.last} is out of {low:.4g} to {high:.4g}": (
-            low - step <= min(lasts) and largest <= high + step
+            low - rounding <= min(lasts) and largest <= high + rounding
         ),
         f"the last value {claim.last} is under half of {claim.figure()}, and no `why` says so": (
             not is_limit or bool(claim.why) or largest >= MIN_OF_LIMIT * limit

@@ -167,6 +167,7 @@ class DifferenceRates:
         earlier_mean, earlier_s = earlier
         acceleration = (mean - earlier_mean) / ((step_s + earlier_s) / 2)
         rate = mean + acceleration * (step_s / 2)
+        # the means are slow enough, but carried on to the end of the step they are not
         if math.hypot(*rate) > self._max_rate_rad_s:
             return sample
         return replace(sample, rate_cam_rad_s=rate, acceleration_cam_rad_s2=acceleration)
@@ -443,7 +444,7 @@ class Opening:
         self._opens = True
 
     def passed(self, arrivals: list[Arrival[wire.Event]], now_ns: int) -> list[Arrival[wire.Event]]:
-        """What goes on now, of what arrived and what was held."""
+        """The messages to pass on now, of those that arrived and those held back."""
         out: list[Arrival[wire.Event]] = []
         for arrival in arrivals:
             sample = arrival.event
@@ -475,7 +476,7 @@ class BroadcastDecoder(Decoder):
         self._opening = Opening()
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
-        """What messages say, and those that were held back."""
+        """The decoded messages, with those that were held back before."""
         return self._opening.passed(super().arrivals(messages), self._clock.now_ns())
 
     def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:

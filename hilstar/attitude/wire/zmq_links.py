@@ -67,7 +67,7 @@ class ZmqRoad(ZmqSocket):
         self._lost_until = self._clock.within(0.0)
 
     def opener(self) -> OpenStream:
-        """What another process opens a link on the same socket by."""
+        """A function by which another process opens a link on the same socket."""
         more: dict[str, Any] = {
             "keys": self._keys,
             "topic": self._topic,
@@ -301,8 +301,8 @@ class Feed(Closing):
         self._socket.bind(endpoint)
 
     def give(self, arrival: Arrival[wire.Event]) -> None:
-        """Hand on a message: its bytes, or where those are the source's own words a packet of
-        the same attitude.
+        """Hand on a message with its time of arrival: its bytes where hilstar's own decoder reads
+        them, or else a packet of the same attitude.
         """
         raw = arrival.raw
         if isinstance(arrival.event, wire.AttitudeSample) and not isinstance(
@@ -319,8 +319,8 @@ class Feed(Closing):
 
 
 class FedDecoder(PacketDecoder):
-    """What a Feed hands on: the body's attitudes become a head's camera's, with the time at
-    which they reached the feed.
+    """Decodes what a Feed hands on: each message has the time at which it reached the feed. The
+    body's attitudes become those of a head's camera.
     """
 
     stamped = True

@@ -34,7 +34,7 @@ GUARD_WAITS_S = 0.9
 # a terminal and a wrapper both pass one Ctrl-C on: what comes so soon after a signal is no second
 # one
 ECHO_S = 0.1
-POLL_S = 0.02
+POLL_S = 0.02  # between two looks for a second signal
 PR_SET_PDEATHSIG = 1  # prctl(2)
 SIGNALLED = 128  # and the signal's number: the exit code of a process that a signal ended
 MAX_WAITING_BYTES = 1 << 20
@@ -253,6 +253,9 @@ def _whereabouts() -> str:
 
 
 def _say_if_read(line: str) -> None:
+    """Write a line to stderr where there is room in its pipe: one that nobody reads holds nothing
+    up.
+    """
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
             os.write(2, line.encode())

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-FIFO_PRIORITY = 10
+FIFO_PRIORITY = 10  # of 1 to 99, all of which are above every ordinary process
 # How long another thread may keep Python's lock from the frame loop; 5 ms by default, a third of a
 # frame.
 SWITCH_INTERVAL_S = 0.0005

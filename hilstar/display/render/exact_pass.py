@@ -50,7 +50,7 @@ SUMS_BYTES = 4 * SUMS
 
 
 class PixelSums:
-    """What the shaders see of stars that `cpu_stars` draws: sprites, pixels' sums and levels.
+    """Sprites, sums of light and levels that `cpu_stars` has drawn, as compute shaders read them.
 
     `values` int32 (n,) are the sums, in memory that this GL shares. It lives in its renderer's
     context, which is current in every call.
@@ -85,10 +85,11 @@ class PixelSums:
 
 
 class ExactPass:
-    """Chooses the levels of sprites anew on a plane of a LevelTexture that has the nearest ones.
+    """Chooses the levels of stars by a compute shader, on a plane of a LevelTexture that has the
+    nearest levels.
 
-    `turn` says on which, and for what stars make up there; `left` has room for what all planes
-    leave. It lives in its renderer's context.
+    `turn` says on which plane, and for which errors of the planes before stars make up on it;
+    `left` is a buffer for the errors that all planes leave. It lives in its renderer's context.
     """
 
     def __init__(
@@ -335,8 +336,8 @@ class Memory:
 
 
 def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
-    """A footprint's pixels by distance for each phase; in a word x, y and their parts in the
-    boxes.
+    """The pixels of a footprint, nearest first, for each phase, packed for the shader: x and y in 6
+    bits each, then the pixel's shares of the 3 x 3 and the 5 x 5 box in 10 bits each.
     """
     x, y = order.places()
     away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
@@ -381,8 +382,8 @@ def _ratio(place: float, width_px: float) -> float:
 
 
 def stretches_of(star: IntArray) -> IntArray:
-    """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and
-    of its path.
+    """Stretches of paths along which sprites pass on their errors, (n, 4): the first sprite and the
+    end of each, and those of its path.
     """
     begins = np.flatnonzero(np.diff(star, prepend=star[0] - 1))
     ends = np.append(begins[1:], len(star))

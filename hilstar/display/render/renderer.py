@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Sure, Tiles
     from hilstar.display.render.extended_drawing import ExtendedLayer
 
-FIRST_CAPACITY = 4096
+FIRST_CAPACITY = 4096  # sprites; the buffer grows by doubling
 UNTIMED = nullcontext()
 
 
@@ -310,7 +310,9 @@ class Renderer(Backend):
         self._choose(sprites, sums)
 
     def _forget_cpu(self, stars: CpuStars) -> None:
-        """Something else draws the levels, or has changed them."""
+        """Forget what the CPU drew last: the levels are drawn by something else now, or were
+        changed.
+        """
         stars.forget()
         if self._levels is not None:
             self._levels.in_memory = False
@@ -325,7 +327,7 @@ class Renderer(Backend):
 
     @cached_property
     def _white(self) -> "Renderer":
-        """What draws linear images beside those of primaries."""
+        """A renderer of linear images, for a target of primaries, which has none of its own."""
         return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
 
     @cached_property
@@ -459,7 +461,9 @@ class Renderer(Backend):
         return self._floor_levels
 
     def _sure(self, quantiser: type[PixelQuantiser], sprites: FrameLight | None) -> "Sure | None":
-        """What a quantiser's levels need not know of a disc's light, where there is one plane."""
+        """The bounds beyond which a disc's levels are sure without its exact light: black below the
+        first and white above the second. None with several planes.
+        """
         if self._planes.apart or not self._planes.panels:
             return None
         from hilstar.display.render.disc_tiles import Sure

@@ -201,6 +201,7 @@ class Randr(Closing):
             for number in resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
                     state = None
+                    # an output without a CRTC is connected at most, and shows nothing
                     if output is not None and output.crtc:
                         state = self._state(resources, number, output, modes)
                 if state is not None:

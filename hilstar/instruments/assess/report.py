@@ -44,6 +44,7 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         "limit_arcsec": found.limit_arcsec,
         **({} if found.glass is None else {"glass": found.glass}),
         **({} if found.certificate is None else {"bench": bench_part(found.certificate, parts)}),
+        **({} if found.cube is None else {"cube_to_boresight": found.cube}),
     }
 
 
@@ -206,6 +207,7 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("limit of its stars", limit_text(found.limit_arcsec)),
         *([("bench's own error", bench_text(found))] if found.certificate is not None else []),
         *([("glass", found.glass.line())] if found.glass is not None else []),
+        *([("cube to boresight", found.cube.line)] if found.cube is not None else []),
     ]
 
 

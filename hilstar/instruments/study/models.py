@@ -215,7 +215,7 @@ class MeasuredValue:
 
 
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
-    """What each error of table 2.3 is of, by the error's name."""
+    """The figure that each error of table 2.3 belongs to, by the error's name."""
     pm_ra = catalog.pm_ra_cosdec_mas_yr
     pm_dec = catalog.pm_dec_mas_yr
     return {

@@ -67,7 +67,9 @@ class Load:
         return f"{note} {capital(self.caution)}."
 
     def judged(self, lines: Sequence[str]) -> Judged:
-        """What a study of times found: on a busy machine with the caution, and not judged."""
+        """The lines of a study of times and True; on a busy machine the caution with them, and
+        None, as such times are not judged.
+        """
         if self.busy:
             return [*lines, self.caution], None
         return list(lines), True

@@ -539,7 +539,9 @@ def draw_beat(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]
 
 @dataclass(frozen=True, slots=True)
 class ForetoldBeat:
-    """What a phase of the exposure does to a star, by `run.sync`; columns as BeatPoint's."""
+    """The error of a star that `run.sync` foretells for a phase of the exposure; its columns are
+    those of BeatPoint.
+    """
 
     refreshes: float
     lit: float

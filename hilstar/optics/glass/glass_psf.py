@@ -183,12 +183,12 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class _Stamps:
-    """What pixels get: `stamps` (R, side^2), whose coefficients are polynomials of a star's place
-    in its pixel.
+    """Stamps, images of the light of pixels, from which PSFs are mixed: `stamps` (R, side^2).
 
-    `parts` (squares, 6 K, R) are what basis images have of a stamp in each square of the pixel,
-    rows first, by `_terms`. `sums` (R,) are those of the stamps, and `light` (K, n) is what pixels
-    get of basis images at all tabulated places.
+    The coefficient of a stamp is a polynomial of a star's place within its pixel. `parts` (squares,
+    6 K, R) are the polynomials' coefficients for each basis image and each square of a pixel, in
+    the order of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light of pixels
+    by basis image at all tabulated places.
     """
 
     stamps: Float32Array
@@ -289,13 +289,15 @@ class GlassPsf(SampledPsf):
         return max(float(self._table.max()), float(self._centred().max()))
 
     def _centred(self) -> Float32Array:
-        """What pixels get of each PSF (F L, side^2) of a star in a pixel's middle."""
+        """The light (F L, side^2) of the pixels about a star in the middle of a pixel, by each of
+        the PSFs.
+        """
         weights = self.optics.weights.reshape(-1, len(self.optics.basis)).astype(np.float32)
         return self._parts(weights, *np.zeros((2, len(weights)))) @ self._stamps.stamps
 
     def _tabulated(self, steps: int) -> list[FloatArray]:
-        """What pixels of the footprint get of the basis' rows and columns: (steps + 1, side,
-        samples), by place in a pixel.
+        """The light that pixels of the footprint collect from the rows and the columns of basis
+        images, (steps + 1, side, samples) each, by the star's place within its pixel.
         """
         side = self.footprint_px
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
@@ -386,8 +388,8 @@ class GlassPsf(SampledPsf):
         return np.asarray(light.reshape(-1, len(optics.basis)), dtype=np.float32)
 
     def _parts(self, weights: Float32Array, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
-        """What stars at places (n,), by square, that have `weights` (n, K) of the basis images
-        have of each stamp (n, R).
+        """The coefficients (n, R) of the stamps for stars at places (n,), sorted by `_square`, with
+        `weights` (n, K) of the basis images.
         """
         square, *within = _square(x_px, y_px, self._squares)
         terms = _terms(*within).astype(np.float32)[:, :, None]
@@ -458,8 +460,8 @@ class GlassPsf(SampledPsf):
     def _drawn(
         self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
     ) -> tuple[Float32Array, Float32Array]:
-        """What pixels get of stars at places (n,), sorted by `_square`: (n, side^2), times
-        factors (n,).
+        """The light (n, side^2) of the pixels about stars at places (n,), sorted by `_square`, and
+        factors (n,) by which it is to be multiplied.
         """
         weights = self._mixed(x_px, y_px, shares)
         parts = self._parts(weights, x_px, y_px)
@@ -732,8 +734,8 @@ def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> FloatArray:
-    """What pixels centred `at_px` (n,) along an axis get of each of `size` samples: (n, size),
-    by `SampledPsf`'s spline.
+    """The light (n, size) that pixels centred at `at_px` (n,) along an axis collect from each of
+    `size` samples, by the spline of `SampledPsf`.
     """
     from scipy.interpolate import make_interp_spline
 

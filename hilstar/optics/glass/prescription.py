@@ -142,7 +142,9 @@ def _read(path: Path) -> "_Lens":
 
 
 def _stated(path: Path, data: bytes) -> LensPrescription | None:
-    """What a file states; None for optiland's own, which are its to read."""
+    """The prescription in a .zmx or .seq file; None for optiland's own format, which optiland
+    reads.
+    """
     if path.suffix.lower() == ".zmx":
         return read_zemax(data)
     if path.suffix.lower() == ".seq":
@@ -371,7 +373,7 @@ def _filled(rays: int) -> FloatArray:
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The area that neighbours of a grid span in (a, b)."""
+    """The determinant of the map from a grid's cells to (a, b): the area of each cell there."""
     (a_down, a_right), (b_down, b_right) = np.gradient(a), np.gradient(b)
     return np.asarray(a_right * b_down - a_down * b_right)
 

@@ -170,6 +170,7 @@ class FaultView:
                 raise InputError(f"file = {fault.file!r}: {advice}")
             else:
                 values = read_map(self._folder / fault.file)
+                # The fault states the light of the brightest pixel, else the map's own is meant.
                 if fault.electrons_per_s is not None or fault.electrons is not None:
                     values = values / values.max()
                 of_its_frame = by.tracker if fault.frame == "tracker" else by.monitor

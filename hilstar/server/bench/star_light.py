@@ -121,6 +121,7 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
         chosen = chosen.at_phase(sky_jd(config, None))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
+    # A moving sky has its observer's place and velocity; without one the bench file has them.
     if moving is not None:
         vectors = moving.stars_seen(vectors, catalog.parallax_mas)
     elif any(sky.observer_velocity_km_s):

@@ -9,14 +9,15 @@ tools/make_page_protocol.py).
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import msgspec
 
 from hilstar.attitude.wire.packet import Reason
 
 if TYPE_CHECKING:
-    from hilstar.server.serve import Running
+    from hilstar.attitude.receiver import PacketCounts
+    from hilstar.server.loop import FrameLoop
 
 # The panels of the page; HIDDEN is in the state and the metrics alone, or drawn in another way.
 Panel = Literal["pointing", "source", "run", "tracker", ""]
@@ -44,6 +45,16 @@ class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
     refused: dict[str, int] = {}
 
 
+class CountedRun(Protocol):
+    """What the page shows of a run's counters (`hilstar.server.run_progress.Running`)."""
+
+    @property
+    def loop(self) -> "FrameLoop": ...  # noqa: D102
+
+    @property
+    def packets(self) -> "PacketCounts": ...  # noqa: D102
+
+
 class FigureMetric(NamedTuple):
     """A metric of `GET /metrics`, named without `hilstar_`; its unit is `scale` of the figure's."""
 
@@ -66,7 +77,7 @@ class PageFigure:
     key: str
     unit: str = ""
     digits: int = 0
-    source: "Callable[[Running], int | dict[str, int]] | None" = None
+    source: "Callable[[CountedRun], int | dict[str, int]] | None" = None
     form: Form = "number"
     text: str = "{}"
     none: str = NONE
@@ -332,7 +343,7 @@ def _some(counts: Mapping[Reason, int]) -> dict[str, int]:
     return {reason: count for reason, count in counts.items() if count}
 
 
-def counts_of(running: "Running") -> RunCounts:
+def counts_of(running: CountedRun) -> RunCounts:
     """The counts of a run, each from its row's source."""
     counts: dict[str, Any] = {}
     for figure in FIGURES:

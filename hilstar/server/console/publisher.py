@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from hilstar.server.live_answers import LiveAnswers
     from hilstar.server.pacer import Shown
     from hilstar.server.record.ledger import Ledger, LedgerSwitch
+    from hilstar.server.run_progress import Running
     from hilstar.server.screen.screen import Screen
-    from hilstar.server.serve import Running
 
 MIN_PICTURE_NS = NS_PER_S // 10
 MAX_CLIPPED = 300  # by name; a picture has hundreds of stars

@@ -55,6 +55,7 @@ CAUTION = (
     "Drawn by a bench that is not the run's own: a file that it names has changed since, or another"
     " version of hilstar wrote the ledger. Codes may differ from those shown."
 )
+NO_VALUES = "- / - / -"  # how a row of percentiles begins that the run has no values of
 BINS = 60
 HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
 MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relative to its values
@@ -257,7 +258,7 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
         return {
             "about": about,
             "verdict": verdict(summary, run.counted["late"]),
-            "summary": rows[:-3],
+            "summary": [row for row in rows[:-3] if not row[1].startswith(NO_VALUES)],
             "facts": rows[-3:],
             "bench_text": run.head.get("bench_text", ""),
             "duration_s": summary.duration_s,

@@ -41,8 +41,8 @@ def has_aravis() -> bool:
 
 
 def list_cameras() -> list[dict[str, str]]:
-    """The cameras that Aravis sees: `id`, `vendor`, `model`, `serial`, `address`; none without
-    Aravis.
+    """The cameras that Aravis sees: `id`, `vendor`, `model`, `serial`, `address` and
+    `protocol`; none without Aravis.
     """
     try:
         listed = subprocess.run(

@@ -53,7 +53,10 @@ def unpacked(data: bytes, pixel_format: str, width_px: int, height_px: int) -> D
 
 def _from_threes(data: bytes, bits: int, count: int) -> npt.NDArray[np.unsignedinteger]:
     """GigE Vision: the upper 8 bits of two pixels, and the lower ones of both between them."""
-    triples = np.frombuffer(data[: len(data) // 3 * 3], np.uint8).reshape(-1, 3).astype(np.uint16)
+    padded = data + bytes(len(data) % 3 == 2)  # the last one of an odd count has two bytes
+    triples = (
+        np.frombuffer(padded[: len(padded) // 3 * 3], np.uint8).reshape(-1, 3).astype(np.uint16)
+    )
     low_bits = bits - 8
     mask = (1 << low_bits) - 1
     pairs = np.empty((len(triples), 2), np.uint16)

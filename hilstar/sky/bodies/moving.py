@@ -517,8 +517,8 @@ class MovingSky:
 
 
 def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatArray | None:
-    """The observer's velocity (3,) by which directions of the start are aberrated; None where
-    that is not seen.
+    """The observer's velocity (3,), km/s, relative to that of the start, by which directions are
+    aberrated; None where that moves nothing.
     """
     change = now[-1, :3]
     if velocity_km_s is not None:

@@ -222,6 +222,8 @@ Promise.all([import("/static/health.js"), import("/static/figures.js")]).then(([
   const rows = {};
   figures.writeFigures("run", { frame: { clipped: [32349, 7, "Mars"] }, ledger: null, counts: { accepted: 1200, received: 1300, missed: 2 } },
     { set: (name, text, shade) => (rows[name] = [text, shade]) });
+  const tracker = { rms_arcsec: [1.25, -2, 3], availability: 0.914, rate_hz: 10, refused: { crc: 2 }, trouble: "" };
+  figures.writeFigures("tracker", { tracker }, { set: (name, text, shade) => (rows[name] = [text, shade]) });
   done([judged.headline, judged.reasons, rows]);
 });
 """
@@ -235,6 +237,9 @@ def test_late_frames_are_no_wrong_sky_and_stars_have_the_pictures_names(live):
     assert rows["Ledger"] == ["not written", "warn"]
     assert rows["Packets"] == ["1\u202f200 of 1\u202f300 accepted", ""]
     assert rows["Missed"] == ["2", "warn"] and rows["Frames"] == ["\u2013", ""]
+    assert rows["Rms"][0].replace("\u00a0", " ") == "+1.3  \u22122.0  +3.0\u2033"
+    assert rows["Availability"][0].replace("\u00a0", " ") == "91.4 % at 10.0 Hz"
+    assert rows["Refused"] == ["2 crc", "warn"] and rows["Line"] == ["in order", ""]
 
 
 def test_on_a_phone_every_overlay_s_button_is_whole(live):

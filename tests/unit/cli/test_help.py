@@ -12,6 +12,7 @@ import hilstar
 from hilstar.basics.errors import InputError
 from hilstar.cli.app import application, run
 from tests.support.benches import ROOT
+from tests.support.commands import assert_refused, run_hilstar_here
 
 
 def lines_of(group: Typer) -> Iterator[list[str]]:
@@ -55,6 +56,20 @@ def test_an_option_says_what_its_value_is(words, capsys):
 def test_a_seed_that_no_file_can_hold_is_refused():
     with pytest.raises(InputError, match=f"--seed {2**63}: write 0 to {2**63 - 1}"):
         run(["simulate", "bench.toml", "--radec", "0,0,0", "--seed", str(2**63)])
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["frame"], ["calibrate"], ["calibrate", "dots"]], ids=" ".join
+)
+def test_help_of_a_command_is_what_its_option_prints(words, capsys):
+    assert not run([*words, "--help"])
+    by_option = capsys.readouterr().out
+    assert not run(["help", *words])
+    assert capsys.readouterr().out == by_option
+
+
+def test_help_of_no_command_says_which_was_meant(tmp_path):
+    assert_refused(run_hilstar_here("help", "fram", cwd=tmp_path), 2, "did you mean frame?")
 
 
 def test_the_version_is_the_package_s(capsys):

@@ -134,6 +134,7 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
         *(np.array([(size - 1) / 2]) for size in tracker.resolution_px)
     )
     width, height = monitor.resolution_px
+    # Where the bench file has the tracker look far beside the middle, it may well be wrong.
     if not (abs(middle_x - width / 2) < width / 4 and abs(middle_y - height / 2) < height / 4):
         middle_x = (width - 1) / 2
         middle_y = (height - 1) / 2

@@ -311,7 +311,7 @@ class SceneMeasurement:
         ]
 
     def untimed(self) -> list[CombinationRow]:
-        """Every combination's error, which no machine changes, without times."""
+        """Every combination's error, which is the same on every machine; its times are NaN."""
         untimed = Times(math.nan, math.nan, math.nan, math.nan, 0)
         return [self.row(self.chain(combination), untimed) for combination in self.combinations]
 

@@ -604,7 +604,7 @@ def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
 def judged(
     case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR
 ) -> FailureCase:
-    """Rounding against `exact`, by the light of each group of stars."""
+    """Compares rounding with `exact` by the light of each group of stars."""
     fault = error_steps(codes_of(scene, "round"), scene)
     error = error_steps(exact_codes(scene), scene)
     return FailureCase(

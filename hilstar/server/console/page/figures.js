@@ -27,7 +27,8 @@ function number(value, unit, digits) {
 function signedAll(values, unit, digits) {
   const pairs = [];
   for (let k = 0; k < values.length; k += 2) pairs.push(values.slice(k, k + 2).map((value) => signed(value, digits)).join("\u00a0\u00a0"));
-  return pairs.join(values.length === 3 ? "\u00a0\u00a0" : "  ") + (unit ? `\u00a0${unit}` : "");
+  const gap = /^\w|^\u00b0/.test(unit) ? "\u00a0" : ""; // none before a mark of minutes or seconds
+  return pairs.join(values.length === 3 ? "\u00a0\u00a0" : "  ") + gap + unit;
 }
 
 const FORMS = {

@@ -207,4 +207,6 @@ class TcpRoad(ByteRoad):
 
 def _endpoint(place: tuple[str, int]) -> str:
     host, port = place
-    return f"tcp://{f'[{host}]' if ':' in host else host}:{port}"
+    if ":" in host:
+        return f"tcp://[{host}]:{port}"
+    return f"tcp://{host}:{port}"

@@ -137,8 +137,8 @@ def faults_of_tables(tables: list[Table], pages: dict[str, str], root: Path) -> 
         if not (root / path).is_file() or name not in definitions(root / path):
             found.append(f"{place} does not exist")
             continue
-        words = uses_of(root / path, name, root).words
-        unused = [word for word in table.names if not any(word in other for other in words)]
+        uses = uses_of(root / path, name, root)
+        unused = [word for word in table.names if not uses.has(word)]
         if unused:
             found.append(f"{place} does not use {', '.join(unused)}")
         if table.is_outside() and not (table.against and table.names):
@@ -215,6 +215,10 @@ class Uses:
     imports: set[str]
     has_own_bound: bool
 
+    def has(self, word: str) -> bool:
+        """Whether a word stands in one of the test's."""
+        return any(word in other for other in self.words)
+
     def names_claim(self, claim: str) -> bool:
         """Whether the claim's name stands in the test."""
         return claim in self.words or any(re.fullmatch(text, claim) for text in self.patterns)
@@ -245,7 +249,7 @@ def faults_of_test(claim: Claim, root: Path, known: dict[str, Uses]) -> list[str
     if claim.test not in known:
         known[claim.test] = uses_of(root / path, name, root)
     uses = known[claim.test]
-    unused = [word for word in claim.names if not any(word in other for other in uses.words)]
+    unused = [word for word in claim.names if not uses.has(word)]
     rules = {
         "does not hand a value to holds": bool(uses.values) and uses.names_claim(claim.id),
         "hands a constant to holds": not any(is_constant(value) for value in uses.values),

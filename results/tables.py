@@ -110,6 +110,15 @@ def kinds_table() -> str:
     return table(["ms, median", "stars", "codes", *dict.fromkeys(r["kind"] for r in rows)], body)
 
 
+def error_text(error: float, unit: str) -> str:
+    """An error with its unit, a share of 1 in per cent."""
+    if error == 0:
+        return "none"
+    if unit == "1":
+        return f"{figure(100 * error)} %"
+    return f"{figure(error)} {unit}"
+
+
 def tradeoff_table() -> str:
     """Each step's default beside its exact method."""
     steps: dict[str, list[dict[str, str]]] = {}
@@ -119,11 +128,7 @@ def tradeoff_table() -> str:
     for step, rows in steps.items():
         default = next(row for row in rows if row["default"] == "True")
         exact = [row for row in rows if row["exact"] == "True" and row is not default]
-        error = (
-            "none"
-            if float(default["error"]) == 0
-            else f"{figure(float(default['error']))} {default['error_unit']}"
-        )
+        error = error_text(float(default["error"]), default["error_unit"])
         beside = f"{exact[0]['method']}: {figure(float(exact[0]['time_ms']))} ms" if exact else "-"
         body.append(
             [step, default["method"], error, f"{figure(float(default['time_ms']))} ms", beside]

@@ -25,7 +25,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.study.row_charts import name_places
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.study_benches import (
     FULL_HD,
     GLASS,
     Isolation,

@@ -307,6 +307,11 @@ CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
 READ_OTHERWISE = tuple(read_otherwise(readings()))
 
 
+def _sums_from_zero(steps: FloatArray) -> FloatArray:
+    """The sums (n + 1, k) of steps (n, k) up to each, from 0."""
+    return np.vstack((np.zeros(steps.shape[1]), np.cumsum(steps, axis=0)))
+
+
 def _turns_rad(q: FloatArray) -> FloatArray:
     """The turn (n - 1, 3) from each attitude (n, 4) to the next, as a rate times a second."""
     return -to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
@@ -331,10 +336,10 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     count = int(whole.sum())
     if count < max(MIN_INTERVALS, (len(samples) - 1) / 2):
         return None
-    at_s, turned, summed, as_icrs = (
-        np.vstack((np.zeros(part.shape[1]), np.cumsum(part[whole], axis=0)))
-        for part in (step_s, turn_rad, mean * step_s, rotate(q[1:], mean) * step_s)
-    )
+    at_s = _sums_from_zero(step_s[whole])
+    turned = _sums_from_zero(turn_rad[whole])
+    summed = _sums_from_zero((mean * step_s)[whole])
+    as_icrs = _sums_from_zero((rotate(q[1:], mean) * step_s)[whole])
     weight = at_s[:, 0] - at_s.mean()
     spread_s2 = float(weight @ weight)
     turn = weight @ turned / spread_s2

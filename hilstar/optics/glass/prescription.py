@@ -518,10 +518,9 @@ def _counted(
     """Rays shared out among the four samples nearest to each."""
     lit = rays.light > 0
     light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
-    x, y = (
-        (place[lit] + cosine / cos_z * defocus_mm - centre_px) / step_mm + side // 2
-        for place, cosine, centre_px in ((rays.x, cos_x, centre[0]), (rays.y, cos_y, centre[1]))
-    )
+    x_mm = rays.x[lit] + cos_x / cos_z * defocus_mm - centre[0]
+    y_mm = rays.y[lit] + cos_y / cos_z * defocus_mm - centre[1]
+    x, y = x_mm / step_mm + side // 2, y_mm / step_mm + side // 2
     column = np.floor(x).astype(np.intp)
     row = np.floor(y).astype(np.intp)
     image = np.zeros((side, side))

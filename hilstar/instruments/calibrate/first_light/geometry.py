@@ -320,10 +320,9 @@ def orientation(context: StepContext) -> StepOutcome:
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
-    keys = ("flip_x", "flip_y", "rotate_deg")
-    changes = tuple(
-        change for key in keys for change in context.change("monitor", key, getattr(after, key))
-    )
+    changes: tuple[KeyChange, ...] = ()
+    for key in ("flip_x", "flip_y", "rotate_deg"):
+        changes += tuple(context.change("monitor", key, getattr(after, key)))
     if (before.rotate_deg - after.rotate_deg) % 180:
         width, height = monitor.resolution_px
         changes += (

@@ -500,9 +500,8 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     """
     width, height = resolution_px
     shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
-    shapes = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)] or shapes[
-        :1
-    ]
+    determined = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)]
+    shapes = determined or shapes[:1]
     designs = [_design(dots, shape, resolution_px) for shape in shapes]
     relative = light / np.median(light)
     used = _tame(relative, designs[-1], shapes[-1])
@@ -511,11 +510,11 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
         _held_out(relative, design, shape, used, fold)
         for design, shape in zip(designs, shapes, strict=True)
     ]
-    best = min(squares, key=lambda each: float(each[used].mean()))
-    worse = [(each - best)[used] for each in squares]
-    place = next(
-        k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each))
-    )
+    best = min(squares, key=lambda square: float(square[used].mean()))
+    # the coarsest grid that the best one does not surely beat
+    place = 0
+    while _is_surely_larger(squares[place][used], best[used]):
+        place += 1
     grid = _fitted(relative[used], designs[place][used], shapes[place])
     square = float(squares[place][used].mean())
     count = int(used.sum())
@@ -537,6 +536,12 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
         fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedoms.of(place) / count),
         missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
     )
+
+
+def _is_surely_larger(squares: FloatArray, others: FloatArray) -> bool:
+    """Whether the mean of squares (n,) is larger than that of others by SURE standard errors."""
+    more = squares - others
+    return bool(more.mean() > SURE * more.std() / math.sqrt(len(more)))
 
 
 def _not_negative(found: float, error: float) -> float:

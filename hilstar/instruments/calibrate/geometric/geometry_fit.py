@@ -314,13 +314,12 @@ def matched(
             plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX
         )
         # The largest model that these centroids can determine.
-        names = next(
-            (names for names in (fits.BROWN_CONRADY, fits.RADIAL) if len(data) > 2 * len(names)),
-            fits.PINHOLE,
-        )
-        model = fits.Model(
-            names, tracker_names if names is fits.BROWN_CONRADY else (), len(look.q_poses)
-        )
+        if len(data) > 2 * len(fits.BROWN_CONRADY):
+            model = fits.Model(fits.BROWN_CONRADY, tracker_names, len(look.q_poses))
+        elif len(data) > 2 * len(fits.RADIAL):
+            model = fits.Model(fits.RADIAL, (), len(look.q_poses))
+        else:
+            model = fits.Model(fits.PINHOLE, (), len(look.q_poses))
         rough = fits.fit(problem, model, 0, data)
         reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px) * problem.monitor_px_per_px
         data = match_by_geometry(plan, seen, rough.geometry, reach_px)

@@ -88,15 +88,17 @@ def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
     by_arcsec, by_mag = (front(rows, name) for name in ("error_arcsec", "error_mag"))
     filed = [k for k, row in enumerate(rows) if left_to_effort(row, rows[auto_of(rows)])]
     as_filed = dict(zip(filed, front([rows[k] for k in filed], "error_arcsec"), strict=True))
-    return [
-        replace(
-            row,
-            on_front=said(a),
-            on_front_mag=said(m),
-            on_front_as_filed=said(as_filed.get(k, False)),
+    with_fronts: list[CombinationRow] = []
+    for k, row in enumerate(rows):
+        with_fronts.append(
+            replace(
+                row,
+                on_front=said(by_arcsec[k]),
+                on_front_mag=said(by_mag[k]),
+                on_front_as_filed=said(as_filed.get(k, False)),
+            )
         )
-        for k, (row, a, m) in enumerate(zip(rows, by_arcsec, by_mag, strict=True))
-    ]
+    return with_fronts
 
 
 def without_fronts(row: CombinationRow) -> CombinationRow:

@@ -417,6 +417,11 @@ class SkyComparison:
         """Whether both images are one sky, in every channel."""
         return not self.bad and all(channel.same for channel in self.channels.values())
 
+    def __repr__(self) -> str:
+        if self.same:
+            return f"<hilstar comparison: the same sky, {self.star_count} stars>"
+        return f"<hilstar comparison: NOT the same sky, {len(self.bad)} of {self.star_count} stars>"
+
     @property
     def star_count(self) -> int:
         """How many stars the golden image has."""

@@ -100,6 +100,12 @@ class LightBudget:
     out_of_gamut: float | None
     star: StarSize
 
+    def __repr__(self) -> str:
+        return (
+            f"<hilstar budget: {self.method}, {self.bits} bits, stars from V ="
+            f" {self.clips_v_mag:.2f} (clips) to {self.nothing_v_mag:.2f} (shows nothing)>"
+        )
+
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     """The budget of a bench, places as `centroider` finds them in the tracker's pixels after its

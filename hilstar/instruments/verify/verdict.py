@@ -341,6 +341,11 @@ class Verdict:
         """True without any reason against it."""
         return not self.reasons
 
+    def __repr__(self) -> str:
+        words = "passed" if self.passed else "not passed"
+        counts = f"stars: {self.errors.looked_for}, reasons against it: {len(self.reasons)}"
+        return f"<hilstar verdict: {words}, {counts}>"
+
 
 def judge(measured: Measured) -> Verdict:
     """The verdict over all fields."""

@@ -63,6 +63,7 @@ DARK = {
     TEAL: "#56cfe0",
     RED: "#ff7b7b",
 }
+KEY = re.compile(r"\w+(?:_|\.)\w")
 # by figure, while it is drawn
 _SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()
 STYLE: Any = {
@@ -160,6 +161,7 @@ def panels_of(
         grid = figure.subplots(
             rows, columns, sharex=share_x, sharey=share_y, squeeze=False, height_ratios=heights
         )
+        finding = finding.replace(" +- ", " \N{PLUS-MINUS SIGN} ")
         figure.suptitle(title_lines(capital(finding)), x=0.01, ha="left", fontsize=TITLE_PT)
         if note:
             figure.supxlabel(
@@ -209,8 +211,10 @@ def finish(figure: "Figure") -> None:
 
 
 def capital(text: str) -> str:
-    """A text with a capital first, unless it begins with a symbol of one letter (x, y)."""
-    if re.match(r"\w\w|a ", text):
+    """A text with a capital first, unless it begins with a symbol of one letter (x, y) or a key
+    of a file (tracker.aperture_mm).
+    """
+    if re.match(r"\w\w|a ", text) and not KEY.match(text):
         return text[:1].upper() + text[1:]
     return text
 

@@ -202,12 +202,16 @@ def _choices(kind: Any) -> tuple[Any, ...]:
 
 
 def _place(names: list[str]) -> str:
+    """The table of these names, and its number where it is one of a list."""
+    if names and names[-1].isdigit():
+        return f"[[{'.'.join(names[:-1])}]] number {int(names[-1]) + 1}: "
     return f"[{'.'.join(names)}] " if names else ""
 
 
 def _fields(root: type[Table], names: list[str]) -> tuple[msgspec.structs.FieldInfo, ...]:
     table: Any = root
-    for name in names:
+    # an index of a list of tables is no key
+    for name in (name for name in names if not name.isdigit()):
         hint = plain({field.name: field.type for field in msgspec.structs.fields(table)}[name])
         table = (get_args(hint) or (hint,))[0]  # X in `X | None`
     return msgspec.structs.fields(table)

@@ -202,6 +202,12 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return self.bayer is not None and self.solver_image == "superpixel"
 
     @property
+    def saturation_dn(self) -> float:
+        """The level at which a pixel saturates: the ADC's last code, or the full well, DN."""
+        full_well_dn = self.offset_dn + self.full_well_e / self.gain_e_per_dn
+        return min(2.0**self.bits - 1, full_well_dn)
+
+    @property
     def dark_factor(self) -> float:
         """What the temperature does to dark rates: 1 at the reference temperature (thesis eq.
         4.12).

@@ -51,7 +51,7 @@ from hilstar.optics.sprites import FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Sure, Tiles
-    from hilstar.display.render.extended import ExtendedLayer
+    from hilstar.display.render.extended_drawing import ExtendedLayer
 
 FIRST_CAPACITY = 4096  # sprites; the buffer grows by doubling
 UNTIMED = nullcontext()
@@ -333,7 +333,7 @@ class Renderer(Backend):
     @cached_property
     def _extended(self) -> "ExtendedLayer":
         # no frame of stars alone needs it
-        from hilstar.display.render.extended import ExtendedLayer
+        from hilstar.display.render.extended_drawing import ExtendedLayer
 
         return ExtendedLayer(self._ctx, self.target.resolution_px)
 

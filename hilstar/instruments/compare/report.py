@@ -18,6 +18,7 @@ from hilstar.basics.charts import (
     capital,
     chart,
     title_lines,
+    two_digits,
     write_csv,
 )
 from hilstar.basics.files import write_whole
@@ -252,7 +253,7 @@ def _figures(comparison: SkyComparison) -> Iterator[KeyFigure]:
 def _error(value: float | None, unit: str, of: str) -> KeyFigure:
     if value is None:
         return KeyFigure(DASH, of)
-    return KeyFigure(f"{value:.2g} {unit}", of)
+    return KeyFigure(f"{two_digits(value)} {unit}", of)
 
 
 def _cards(comparison: SkyComparison, figure: Any) -> Iterator[Card]:

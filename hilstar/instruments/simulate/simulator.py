@@ -191,7 +191,9 @@ class Simulator(Closing):
             self._load_tracker()
         self._layers = sky_layers(self.canvas, self.sources)
         target = Target(self.config.tracker.resolution_px, self.canvas.psf)
-        if target != self.renderer.target:
+        drawn = self.renderer.target
+        # not the targets: a comparison of their arrays is no truth value
+        if (target.resolution_px, target.psf) != (drawn.resolution_px, drawn.psf):
             self.renderer.close()
             self.renderer = open_backend(target, headless_context(self.config.render.gpu))
 

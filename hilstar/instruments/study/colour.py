@@ -27,7 +27,7 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import magnitude
 from hilstar.display.response import Levels, srgb_response
 from hilstar.instruments.simulate.budget import RED_NM, SOLAR_BV
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.study_benches import (
     GLASS,
     Isolation,
     bench_text,

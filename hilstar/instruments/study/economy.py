@@ -14,7 +14,7 @@ from hilstar.basics.charts import BLUE, MUTED, ORANGE, RED, chart, write_records
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.study_benches import (
     FULL_HD,
     GLASS,
     Isolation,

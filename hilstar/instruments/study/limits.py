@@ -29,7 +29,7 @@ from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.assess.bench_effects import turn_between
 from hilstar.instruments.study import codes
 from hilstar.instruments.study.predictors import ORION, predictors, rate_of, slew_attitude
-from hilstar.instruments.study.settings import held_out_errors, study_optics
+from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import brightest, max_stars
 from hilstar.server.bench.config import RenderSettings

@@ -43,14 +43,14 @@ from hilstar.instruments.study.row_charts import (
     draw_curves,
     write_columns,
 )
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.sky_figures import FIGURES as SKY_FIGURES
+from hilstar.instruments.study.study_benches import (
     APERTURE_MM,
     MAX_RELIABLE_VI_MAG,
     held_out_by_type,
     held_out_errors,
     study_optics,
 )
-from hilstar.instruments.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.sky.catalog import Catalog, load_catalog
 from hilstar.sky.electrons import (
     REFERENCE_TEMPERATURE_K,

@@ -37,7 +37,7 @@ from hilstar.instruments.simulate.twin import Twin, TwinField, true_calibration
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.config import BenchConfig
-from hilstar.server.bench.moving import wide_bodies
+from hilstar.server.bench.moving_sky import wide_bodies
 from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.centroids import (

@@ -39,7 +39,7 @@ from hilstar.optics.layers.view import Canvas
 from hilstar.optics.psf import Psf
 from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import AddedLight, FrameLight, pack_sprites
-from hilstar.sky.catalog import star_names
+from hilstar.sky.named_stars import hip_named
 from hilstar.sky.stars import Stars
 
 TRACK_SEED = 2  # beside the number of an exposure
@@ -403,9 +403,9 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     number = re.fullmatch(r"HIP (\d{1,9})", wanted)
     if number is not None:
         return np.flatnonzero(stars.hip == int(number[1]))
-    for hip, names in star_names().items():
-        if wanted in (names.name, names.designation):
-            return np.flatnonzero(stars.hip == hip)
+    hip = hip_named(wanted)
+    if hip is not None:
+        return np.flatnonzero(stars.hip == hip)
     identifier = stars.catalog.identifier_of(wanted)
     if identifier is None:
         return np.empty(0, dtype=np.intp)

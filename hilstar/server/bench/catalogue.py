@@ -91,8 +91,8 @@ def bench_catalogue(
     rows = np.flatnonzero(every.v_mag <= limit)
     if not len(rows):
         raise InputError(
-            f"no star of the catalogue is brighter than V = {limit:g}; write a larger --to or [sky]"
-            " faintest_v_mag"
+            f"no star of the catalogue is brighter than V = {limit:g}; write a larger --faintest or"
+            " [sky] faintest_v_mag"
         )
     rows = rows[np.argsort(every.v_mag[rows], kind="stable")]
     if epoch_jyear is None:

@@ -25,7 +25,7 @@ from hilstar.basics.rotation import to_matrix, to_radec_roll_deg
 from hilstar.basics.version import __version__
 from hilstar.display.response import Codes
 from hilstar.optics.camera import Camera
-from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench, Frame
 
 GOOD_PX = 0.01

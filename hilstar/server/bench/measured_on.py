@@ -15,7 +15,7 @@ from hilstar.display.calibration import BUILT_IN, read_toml
 from hilstar.display.geometry import load_notes
 from hilstar.display.identity import MonitorIdentity, differences
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import bench_certificate
+from hilstar.server.bench.certificate_file import bench_certificate
 
 WAYS = "add --force, or measure it again: hilstar certify --again"
 SHOWN_ANYWAY = "shown anyway (--force)"

@@ -83,7 +83,7 @@ def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
     """
     if not has_observer(config):
         return None
-    from hilstar.server.bench.moving import (
+    from hilstar.server.bench.moving_sky import (
         moving_sky,  # importing the ephemeris takes 50 ms, which only bodies and an observer need
     )
 

@@ -44,7 +44,7 @@ from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import caught, stop_on_signal
 from hilstar.basics.wrong_sky import BEGINS, ENDS
-from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench
 from hilstar.server.record.ledger_records import (
     LOST,

@@ -28,15 +28,6 @@ from hilstar.instruments.calibrate.first_light.context import (
 )
 from hilstar.instruments.calibrate.first_light.focus import PLAN_SEED, dot_code, first_dots
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern, black
-from hilstar.instruments.calibrate.geometric.calibration import (
-    Calibrated,
-    calibrate_seen,
-    dot_sigma_px,
-    notes_for_a_person,
-    parameters_of,
-    rough_geometry,
-    write_calibrated,
-)
 from hilstar.instruments.calibrate.geometric.dots import (
     DotPlan,
     dot_image,
@@ -46,6 +37,15 @@ from hilstar.instruments.calibrate.geometric.dots import (
     write_plan,
 )
 from hilstar.instruments.calibrate.geometric.fit import FIELD_DEGREES
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
+    Calibrated,
+    calibrate_seen,
+    dot_sigma_px,
+    notes_for_a_person,
+    parameters_of,
+    rough_geometry,
+    write_calibrated,
+)
 from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares

@@ -19,7 +19,8 @@ from hilstar.basics.pages import (
     Markup,
     Verdict,
     escaped,
-    key_words,
+    key_table,
+    keyed_rows,
     measured,
     page_of,
     paragraph,
@@ -98,7 +99,7 @@ def _link(record: StepRecord) -> str:
 
 def _card(folder: Path, step: SessionStep, record: StepRecord, session: SessionFile) -> Card:
     pictures = [_picture(folder / name) for name in record.pictures]
-    figures = [(key_words(name), value) for name, value in record.figures.items()]
+    figures = keyed_rows(record.figures)
     beside = figures[:MAX_FIGURES_BESIDE] if pictures else []
     return Card(
         title=step.name.capitalize(),
@@ -138,13 +139,13 @@ def _cure(step: SessionStep, record: StepRecord, session: SessionFile) -> str:
     return Markup(f"{escaped(step.cure)} Then, as before: <code>{escaped(again)}</code>")
 
 
-def _figure_table(figures: Sequence[tuple[str, object]]) -> Iterator[str]:
+def _figure_table(figures: Sequence[tuple[str, str]]) -> Iterator[str]:
     if figures:
-        yield table_of(figures)
+        yield key_table(figures)
 
 
 def _details(
-    record: StepRecord, pictures: list[str], figures: Sequence[tuple[str, object]]
+    record: StepRecord, pictures: list[str], figures: Sequence[tuple[str, str]]
 ) -> Iterator[str]:
     yield paragraph(f"{record.ended}, {record.seconds:.1f} s", "small")
     yield from pictures

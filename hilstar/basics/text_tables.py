@@ -249,7 +249,9 @@ class TextTable:
     def _is_header(self, cells: list[str]) -> bool:
         if not self.header or cells[0].strip().strip('"') != self.columns[0].header:
             return False
-        return [column_of(cell).header for cell in cells] == [each.header for each in self.columns]
+        return [column_of(cell).header for cell in cells] == [
+            column.header for column in self.columns
+        ]
 
     def _is_whole(self, cells: list[str], previous: list[str]) -> bool:
         """Whether a row whose line has no end is whole, by its last cell beside those of other

@@ -288,7 +288,9 @@ def within_words(comparisons: list[EffortComparison]) -> str:
 
 
 def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
-    """How much faster each scene is at what it needs, and its errors there, in tolerances."""
+    """The speed-up by `effort = "auto"` in each scene, and the errors that it leaves there,
+    relative to the tolerance.
+    """
     note = (
         "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have"
         " no threshold. Tolerances: "

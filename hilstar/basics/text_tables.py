@@ -877,7 +877,7 @@ def is_valid(path: Path, line: int, cell: str) -> bool:
 
 
 def number_fault(text: str) -> str:
-    """What a cell is that is no finite number, as far as its form says it; "" elsewhere."""
+    """Why a cell is no number, and what to write, where its form shows that; "" elsewhere."""
     if DECIMAL_COMMA.fullmatch(text) and not NOT_SURELY_A_COMMA.fullmatch(text):
         return " (a decimal comma: write a point)"
     if FORTRAN.fullmatch(text):

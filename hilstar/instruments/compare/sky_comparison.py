@@ -138,10 +138,9 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name in ("flux_mag", "centroid_px"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(
-                    f"compare: {name} = {getattr(self, name):g}; write a number above 0"
-                )
+            limit = getattr(self, name)
+            if not isinstance(limit, (int, float, np.number)) or not 0 < limit < math.inf:
+                raise InputError(f"compare: {name} = {limit!r}; write a number above 0")
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,7 +114,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     None takes the bench's own. Raises InputError for a bench without stars.
     """
     by = centroider or bench.config.verify.judge or USUAL
-    found = _errors(bench)
+    errors_by_mag = _errors(bench)
     render = bench.config.render
     white = bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
@@ -141,7 +141,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         ends_nm = [RED_NM]
     else:
         ends_nm = [RED_NM, reddest_nm(spectra)]
-    rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
+    rows = [_row(bench, mag, errors, by, clips) for mag, errors in errors_by_mag]
     return LightBudget(
         method=render.quantisation
         + (

@@ -12,11 +12,9 @@ from hilstar.cli.image_source import Exposure, photographs
 from hilstar.cli.options import (
     BenchFile,
     Json,
-    QuaternionText,
-    RadecText,
     check_files,
-    parse_attitude,
 )
+from hilstar.cli.pointing import QuaternionText, RadecText, StarText, optional_attitude
 from hilstar.server.console.terminal import print_found, say
 
 IMAGES, USUAL_COUNT = "images", 5
@@ -59,10 +57,13 @@ def confront(
         ),
     ] = False,
     radec: RadecText = None,
+    star: StarText = None,
     quaternion: QuaternionText = None,
-    at: Annotated[
+    taken: Annotated[
         str | None,
-        Option("--at", metavar="UTC", help="When the images were taken, where they do not say it."),
+        Option(
+            "--taken", metavar="UTC", help="When the images were taken, where they do not say it."
+        ),
     ] = None,
     as_json: Json = False,
     strict: Annotated[
@@ -72,19 +73,17 @@ def confront(
     """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts
     against them.
     """
-    from hilstar.instruments.confront.files import read_tracker_file
     from hilstar.instruments.confront.images import parse_utc
+    from hilstar.instruments.confront.measured_bench import read_tracker_file
     from hilstar.instruments.confront.run import OUTPUTS
     from hilstar.instruments.confront.run import confront as confront_files
     from hilstar.server.bench.bench_file import BenchFile as ReadFile
 
     check_directory("-o", output)
-    if radec is None and quaternion is None:
-        start = None
-    else:
-        start = parse_attitude("confront", radec, quaternion)
-    at_ns = None if at is None else parse_utc(at)
+    at_ns = None if taken is None else parse_utc(taken)
     file: ReadFile = read_tracker_file(bench_file)[0]
+    epoch_jyear = file.config.sky.epoch_jyear
+    start = optional_attitude("confront", radec, star, quaternion, epoch_jyear)
     given = images or []
     check_files(given, [output / name for name in OUTPUTS], file)
     if grab is not None:

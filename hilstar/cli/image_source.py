@@ -13,7 +13,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
 from hilstar.basics.reading import exists
 from hilstar.basics.resources import resource_path
-from hilstar.cli.options import frames_of, parse_diode
+from hilstar.cli.options import parse_diode
 from hilstar.server.console.terminal import say
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ Exposure = Annotated[
 ShownTo = Annotated[
     str | None,
     Option(
-        "--frames",
+        "--feed",
         metavar="ENDPOINT",
         help="With --grab: hand the frames on to who watches there (tcp://127.0.0.1:5570).",
     ),
@@ -114,21 +114,13 @@ def handed_on(endpoint: str | None, source: "ImageSource") -> Iterator[None]:
         yield
 
 
-def endpoint_of(frames: str | None) -> str | None:
-    """The endpoint of a --frames that takes no number. Raises InputError for one."""
-    count, endpoint = frames_of([frames] if frames else None, heads=False)
-    if count is not None:
-        raise InputError(f"--frames {frames}: write an endpoint such as tcp://127.0.0.1:5570")
-    return endpoint
-
-
 def dot_images(
     file: "files.BenchFile",
     given: list[Path],
     plan: Path,
     grab: str | None,
     exposure_s: float | None,
-    frames: str | None,
+    feed: str | None,
     overwrite: bool,
 ) -> "DotImages":
     """The images of a plan's dots: those given, or taken here. Raises InputError for neither or
@@ -137,7 +129,7 @@ def dot_images(
     from hilstar.instruments.calibrate.grabbed_dots import DotImages, grab_dots
 
     if grab is None:
-        for name, value in (("--exposure", exposure_s), ("--frames", frames)):
+        for name, value in (("--exposure", exposure_s), ("--feed", feed)):
             if value is not None:
                 raise InputError(f"{name}: is for --grab; write --grab, or leave it out")
         if not given:
@@ -145,10 +137,9 @@ def dot_images(
         return DotImages(given, None)
     if given:
         raise InputError(f"{given[0]}: --grab takes the images; leave one of them out")
-    endpoint = endpoint_of(frames)
     with (
         closing(image_source(file, grab, None, None, None, 0)) as source,
-        handed_on(endpoint, source),
+        handed_on(feed, source),
     ):
         return grab_dots(file, source, plan, exposure_s, overwrite=overwrite, tell=say)
 

@@ -9,7 +9,7 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import CSV, check_directory, check_ending
 from hilstar.cli.options import Json, Overwrite, RunFile, check_files, parse_diode
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.instruments.calibrate.latency import Edges
@@ -45,7 +45,7 @@ def latency(
         ),
     ] = None,
     duration: Annotated[
-        float, Option(help="How long to read edges, in seconds.", min=0.5, max=3600)
+        float, Option(metavar="SECONDS", help="How long to read edges.", min=0.5, max=3600)
     ] = 10.0,
     save: Annotated[
         Path | None, Option(metavar="EDGES.csv", help="Save the edges that were read.")
@@ -83,10 +83,12 @@ def latency(
     if edges is not None:
         edges_read = by_diode.read_edges(edges)
     elif diode is not None:
-        edges_read = by_diode.capture_edges(*parse_diode(diode), duration)
+        with busy(f"reading edges for {duration:g} s"):
+            edges_read = by_diode.capture_edges(*parse_diode(diode), duration)
         time.sleep(LEDGER_BEHIND_S)
     else:
-        edges_read = _filmed(ledger, grab or "", duration, exposure)
+        with busy(f"filming the square for {duration:g} s"):
+            edges_read = _filmed(ledger, grab or "", duration, exposure)
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         by_diode.save_edges(save, edges_read)

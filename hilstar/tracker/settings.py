@@ -268,13 +268,15 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """
         light = np.asarray(light_e, dtype=np.float64)
         seconds = self.dark_factor * exposure_s
+        quantisation_e2 = self.gain_e_per_dn**2 / 12
+        if self.quantisation_noise:
+            quantisation_e2 += self.adc_noise_e**2
         return PixelNoise(
             shot_e2=light,
             dark_e2=self.dark_e_per_s * seconds,
             read_e2=self.read_noise_now_e**2,
             reset_e2=self.reset_noise_e**2,
-            quantisation_e2=self.gain_e_per_dn**2 / 12
-            + (self.adc_noise_e**2 if self.quantisation_noise else 0.0),
+            quantisation_e2=quantisation_e2,
             prnu_e2=(self.prnu * light) ** 2,
             dsnu_e2=math.hypot(self.dsnu_e_per_s, self.column_dark_e_per_s) ** 2 * seconds**2
             + self.column_noise_e**2
@@ -286,11 +288,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """Sigma of what the electronics add to the charge: read and reset noise, and the ADC's
         for `quantisation_noise`.
         """
-        return math.hypot(
-            self.read_noise_now_e,
-            self.reset_noise_e,
-            self.adc_noise_e if self.quantisation_noise else 0.0,
-        )
+        adc_noise_e = self.adc_noise_e if self.quantisation_noise else 0.0
+        return math.hypot(self.read_noise_now_e, self.reset_noise_e, adc_noise_e)
 
     @property
     def adc_noise_e(self) -> float:
@@ -349,9 +348,8 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
         )
         mean = shape * math.exp(float(np.log(rate / gammaincinv(shape, share)).mean()))
         return mean, mean / math.sqrt(shape)
-    slope, middle = map(
-        float, np.polyfit(ndtri(share), rate if law == "normal" else np.log(rate), 1)
-    )
+    normal_rate = rate if law == "normal" else np.log(rate)
+    slope, middle = np.polyfit(ndtri(share), normal_rate, 1).tolist()
     if law == "normal":
         if middle < 0:
             raise InputError(

@@ -115,6 +115,8 @@ def read_toml(text: str, folder: Path) -> None:
     if text.startswith("bench = "):  # a campaign's plan
         parse_plan(folder / "plan.toml", text)
         return
+    if "[[clause]]" in text:  # an acceptance's, which its command reads
+        return
     missing = [
         part
         for part in re.split(r"\n(?=\[)", SMALL_BENCH)
@@ -136,7 +138,7 @@ def type_in(block: Block, ports: Ports) -> None:
             if words[0] == "hilstar" and words[-1] == "--console":
                 words.append(f"127.0.0.1:{ports['8765']}")
             # each worker is a process, which takes a second to start
-            if words[:2] == ["hilstar", "campaign"]:
+            if words[:2] in (["hilstar", "campaign"], ["hilstar", "accept"]):
                 words += ["--workers", "1"]
             if step.beside:
                 beside.enter_context(running(words))

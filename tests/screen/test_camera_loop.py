@@ -106,7 +106,7 @@ def test_geometry_and_psf_are_calibrated_by_dots_that_a_camera_takes(screen, tmp
     planned = run_hilstar("calibrate", "dots", bench, "-o", plan, "--frames", "10", "--dots", "25")
     assert planned.returncode == 0, planned.stderr
     with virtual_camera(truth, endpoint) as (address, ended):
-        words = ("--plan", plan, "--grab", f"genicam:{address}", "--frames", endpoint, "--json")
+        words = ("--plan", plan, "--grab", f"genicam:{address}", "--feed", endpoint, "--json")
         geometry = run_hilstar(
             "calibrate",
             "geometric",
@@ -139,7 +139,7 @@ def test_a_bench_is_checked_against_its_file_through_a_camera(screen, tmp_path):
     bench, truth = benches(tmp_path)
     endpoint = f"tcp://127.0.0.1:{free_port()}"
     with virtual_camera(truth, endpoint) as (address, ended):
-        words = ("--check", "--grab", f"genicam:{address}", "--frames", endpoint, "--json")
+        words = ("--check", "--grab", f"genicam:{address}", "--feed", endpoint, "--json")
         checked = run_hilstar(
             "certify", bench, "-o", tmp_path / "c", *words, env=screen.env, timeout=8 * PATIENCE_S
         )

@@ -101,7 +101,7 @@ class Record(msgspec.Struct, frozen=True, omit_defaults=True):
     end: str | None = None
 
     def told_to(self, notices: Notices) -> bool:
-        """Whether it is a notice, which is then passed on."""
+        """Passes the record on where it is a notice; whether it is one."""
         if self.notice is not None and self.lasting:
             notices.tell(*self.notice)
         elif self.notice is not None:

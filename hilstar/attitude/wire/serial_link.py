@@ -9,6 +9,7 @@ import re
 import select
 import termios
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -64,17 +65,13 @@ def adapters() -> list[str]:
     (0403:6001)".
     """
     ports = sorted(list_ports.comports())
-    lines = []
+    kinds: Counter[str] = Counter()
     for port in ports:
-        lines.append(
-            f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
-            if port.vid is not None
-            else "UART"
-        )
-    return [
-        f"{lines.count(word)} x {word}" if lines.count(word) > 1 else word
-        for word in dict.fromkeys(lines)
-    ]
+        kind = "UART"
+        if port.vid is not None:
+            kind = f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})"
+        kinds[kind] += 1
+    return [f"{count} x {kind}" if count > 1 else kind for kind, count in kinds.items()]
 
 
 def open_port(port: str, baud: int) -> serial.Serial:
@@ -160,11 +157,11 @@ class SerialLink(StreamLink):
                 waiting.append(
                     chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies))
                 )
-        taken = self._gate.newest(waiting, wire.frame_declares_discontinuity)
-        return [
-            Arrival(each.host_ns, self._event(each.parts[0]), each.parts[0], each.waited_ns)
-            for each in taken
-        ]
+        arrivals: list[Arrival[wire.Event]] = []
+        for frame in self._gate.newest(waiting, wire.frame_declares_discontinuity):
+            body = frame.parts[0]
+            arrivals.append(Arrival(frame.host_ns, self._event(body), body, frame.waited_ns))
+        return arrivals
 
     def _event(self, body: bytes) -> wire.Event:
         """What a frame says. One that says nothing may be a piece of a packet that was not

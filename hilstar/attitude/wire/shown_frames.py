@@ -105,10 +105,11 @@ def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
     lit = np.frombuffer(indices, dtype="<u4")
     if len(lit) and not (lit[-1] < head.width * head.height and (lit[1:] > lit[:-1]).all()):
         raise ValueError("its indices do not rise within the image")
-    codes = np.frombuffer(values, dtype="<u1" if head.bits <= 8 else "<u2")
-    return ShownFrame(
-        head, lit, codes.reshape(len(lit), 3) if head.channels == 3 else codes.reshape(len(lit))
-    )
+    code_dtype = "<u1" if head.bits <= 8 else "<u2"
+    codes = np.frombuffer(values, dtype=code_dtype)
+    if head.channels == 3:
+        return ShownFrame(head, lit, codes.reshape(len(lit), 3))
+    return ShownFrame(head, lit, codes.reshape(len(lit)))
 
 
 class FrameSender(ZmqSender):

@@ -168,6 +168,7 @@ class DifferenceRates:
         earlier_mean, earlier_s = earlier
         acceleration = (mean - earlier_mean) / ((step_s + earlier_s) / 2)
         rate = mean + acceleration * (step_s / 2)
+        # the means are slow enough, but carried on to the end of the step they are not
         if math.hypot(*rate) > self._max_rate_rad_s:
             return sample
         return replace(sample, rate_cam_rad_s=rate, acceleration_cam_rad_s2=acceleration)
@@ -389,10 +390,8 @@ class VizardLive(ZmqSocket, LockstepLink):
         word = parts[0]
         if word == SIM_UPDATE:
             return self._step(host_ns, parts)
-        if (
-            word.startswith(REQUEST_IMAGE)
-            and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit()
-        ):
+        number = word.removeprefix(REQUEST_IMAGE)[:MAX_DIGITS]
+        if word.startswith(REQUEST_IMAGE) and number.isdigit():
             image = self._picture(int(number))
             # the length goes ahead, big-endian; 0 where there is none
             self._answer([len(image).to_bytes(4, "big"), image])
@@ -415,9 +414,8 @@ class VizardLive(ZmqSocket, LockstepLink):
             )
         event, update = self._follower.take(message)
         self._sample = event if isinstance(event, wire.AttitudeSample) else None
-        self._described |= {
-            camera.identity: camera for camera in (update.cameras if update is not None else ())
-        }
+        if update is not None:
+            self._described |= {camera.identity: camera for camera in update.cameras}
         return Arrival(host_ns, event, message)
 
     def _picture(self, camera: int) -> bytes:
@@ -456,7 +454,7 @@ class Opening:
         self._opens = True
 
     def passed(self, arrivals: list[Arrival[wire.Event]], now_ns: int) -> list[Arrival[wire.Event]]:
-        """What goes on now, of what arrived and what was held."""
+        """The messages to pass on now, of those that arrived and those held back."""
         out: list[Arrival[wire.Event]] = []
         for arrival in arrivals:
             sample = arrival.event
@@ -489,7 +487,7 @@ class BroadcastDecoder(PacketDecoder):
         self._opening = Opening()
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
-        """What messages say, and those that were held back."""
+        """The decoded messages, with those that were held back before."""
         return self._opening.passed(super().arrivals(messages), self._clock.now_ns())
 
     def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:

@@ -79,7 +79,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         self._lost_until = self._clock.within(0.0)
 
     def opener(self) -> OpenStream:
-        """What another process opens the same socket by."""
+        """A function by which another process opens the same socket."""
         more: dict[str, Any] = {
             "keys": self._keys,
             "topic": self.topic,
@@ -103,11 +103,10 @@ class ZmqReceiver(ZmqSocket, StreamLink):
             return []
         waiting: list[RawMessage] = []
         taken_bytes = 0
-        while (
-            len(waiting) < QUEUE_MESSAGES
-            and taken_bytes < MAX_TAKEN_BYTES
-            and (parts := self._take_parts()) is not None
-        ):
+        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES:
+            parts = self._take_parts()
+            if parts is None:
+                break
             waiting.append(RawMessage(self._clock.now_ns(), parts))
             taken_bytes += sum(map(len, parts))
         return self._gate.newest(waiting, wire.declares_discontinuity)
@@ -308,8 +307,8 @@ class Feed(Closing):
         self._socket.bind(endpoint)
 
     def give(self, arrival: Arrival[wire.Event]) -> None:
-        """Hand on a message: its bytes, or where those are the source's own words a packet of
-        the same attitude.
+        """Hand on a message with its time of arrival: its bytes where hilstar's own decoder reads
+        them, or else a packet of the same attitude.
         """
         raw = arrival.raw
         if isinstance(arrival.event, wire.AttitudeSample) and not isinstance(
@@ -326,8 +325,8 @@ class Feed(Closing):
 
 
 class FedDecoder(PacketDecoder):
-    """What a Feed hands on: the body's attitudes become a head's camera's, with the time at
-    which they reached the feed.
+    """Decodes what a Feed hands on: each message has the time at which it reached the feed. The
+    body's attitudes become those of a head's camera.
     """
 
     stamped = True

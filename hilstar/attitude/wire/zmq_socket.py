@@ -46,10 +46,10 @@ PAGE_BYTES = resource.getpagesize()
 WANTED_FILES = 65_536
 MAX_CONNECTIONS = 64
 MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
-FEW_EVENTS = 50
+FEW_EVENTS = 50  # in one go; after more the link pauses, so that a flood is read at a bounded rate
 # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 EVENT = struct.Struct("=Hi")
-HANDSHAKE_MS = 2000
+HANDSHAKE_MS = 2000  # peers that never finish it would take up all MAX_CONNECTIONS
 LEFT_EARLY = (
     "it left before its handshake, as another type of ZeroMQ socket does,"
     f" or did not finish it within {HANDSHAKE_MS / 1000:g} s"

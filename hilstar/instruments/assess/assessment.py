@@ -44,8 +44,13 @@ from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_conventions
 from hilstar.server.answers.answer import JUMP_NS
 from hilstar.server.answers.judge import TO_MIDDLE, AnswerRules, Stamp
+from hilstar.server.bench.alignment import Turned, cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
-from hilstar.server.bench.certificate import Certificate, bench_certificate
+from hilstar.server.bench.certificate_file import (
+    Certificate,
+    CubeToBoresight,
+    bench_certificate,
+)
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.record.commanded import Commanded
 from hilstar.server.record.commanded_run import NOT_SHOWN, CommandedRun, read_commanded
@@ -285,6 +290,7 @@ class Assessment:
     notes: tuple[str, ...]
     certificate: Certificate | None = None
     out_of_order: int = 0
+    cube: CubeToBoresight | None = None
 
     @property
     def missed_line(self) -> str:
@@ -294,7 +300,7 @@ class Assessment:
         hold_s = self.run.commanded.hold_s
         if not missed:
             return "none"
-        share = 100 * missed / (missed + len(self.run.commanded.t_s))
+        share = 100 * self.run.run.missed_share
         longest = int(np.argmax(hold_s)) if len(hold_s) else -1
         if longest >= 0:
             where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"
@@ -464,10 +470,11 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         np.degrees(np.linalg.norm(error_budget.rate_rad_s, axis=1)), parts.left, error, freedom
     )
     by_magnitude: tuple[Slice, ...] = ()
-    display = limit = glass = certificate = None
+    display = limit = glass = certificate = cube = None
     try:
         file = run.bench_file()
         certificate = bench_certificate(file)
+        cube = _cube_of(file, certificate, error_budget)
         by_magnitude = slices_of(
             field_magnitudes(file, error_budget.commanded_q), parts.left, error, freedom
         )
@@ -521,7 +528,17 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         notes=(*notes, *display_note),
         certificate=certificate,
         out_of_order=out_of_order,
+        cube=cube,
     )
+
+
+def _cube_of(
+    file: BenchFile, certificate: Certificate | None, found: DecomposedRun
+) -> CubeToBoresight | None:
+    """From the alignment reference to the boresight of a tracker with this bias."""
+    low, high = found.intervals.bias
+    turned = Turned(found.bias_arcsec, (high - low) / 2)
+    return cube_to_boresight(file, certificate, turned)
 
 
 def _glass_of(

@@ -13,7 +13,7 @@ from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import DisplayCost, Slice
 from hilstar.instruments.assess.budget import Axes, DecomposedRun
 from hilstar.instruments.assess.figure_rows import FigureRow, limit_rows, limit_text, part_rows
-from hilstar.server.bench.certificate import Certificate, off_by
+from hilstar.server.bench.certificate_file import Certificate, off_by
 
 MAX_NAMED = 10
 MAX_SHARE_SIGMA = 0.5  # a share of the display's error that is less sure says nothing
@@ -44,6 +44,7 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         "limit_arcsec": found.limit_arcsec,
         **({} if found.glass is None else {"glass": found.glass}),
         **({} if found.certificate is None else {"bench": bench_part(found.certificate, parts)}),
+        **({} if found.cube is None else {"cube_to_boresight": found.cube}),
     }
 
 
@@ -206,6 +207,7 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("limit of its stars", limit_text(found.limit_arcsec)),
         *([("bench's own error", bench_text(found))] if found.certificate is not None else []),
         *([("glass", found.glass.line())] if found.glass is not None else []),
+        *([("cube to boresight", found.cube.line)] if found.cube is not None else []),
     ]
 
 

@@ -37,22 +37,25 @@ from hilstar.basics.files import write_whole
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.units import NS_PER_S
-from hilstar.instruments.campaign.cases import AXES, Case, CaseMaker, Q, first_row, spread_row
+from hilstar.instruments.campaign.cases import AXES, Case, CaseMaker, Q, first_row
 from hilstar.instruments.campaign.plan import SCENARIO, Design, Plan
 from hilstar.instruments.campaign.store import Directory, Journal, Row
+from hilstar.instruments.campaign.tally import FrameLists, StarLists, spread_row
 from hilstar.optics.layers.fault_kinds import Now as FaultNow
 from hilstar.optics.layers.view import View
 from hilstar.server.answers.answer import Answer, AnswerSource
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged
 from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
+from hilstar.server.answers.stars import StarResiduals, judge_stars, lit_at
 from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.fault_views import display_view
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import Timetable
 from hilstar.server.loop import FaultyFrames, FrameLoop, Limit
 from hilstar.server.pacer import FrameSink, Moment, Pacer, Shown, ignore
+from hilstar.server.run_progress import Follower, Running
 from hilstar.server.screen.screen import DisplayPacer, Screen
-from hilstar.server.serve import Follower, Running
 
 ORDER_STREAM = 4  # stream of a plan's seed for the order of its cases
 BRIGHTEST = 5  # reported stars whose light is a case's signal
@@ -175,6 +178,8 @@ class Tally:
     errors: list[FloatArray] = field(default_factory=list)
     stars: list[int] = field(default_factory=list)
     signals: list[float] = field(default_factory=list)
+    frames_told: FrameLists = field(default_factory=FrameLists)
+    star_lists: StarLists = field(default_factory=StarLists)
 
     def take(self, judged: Judged, right: bool) -> None:
         """Take an answer into the case's figures."""
@@ -183,6 +188,9 @@ class Tally:
             return
         if right:
             self.errors.append(judged.residual)
+            if judged.lit is not None:
+                reported_rad_s = judged.answer.rate_cam_rad_s
+                self.frames_told.add(judged.lit.rate_rad_s, judged.residual, reported_rad_s)
         else:
             self.wrong += 1
             self.worst_deg = max(
@@ -239,6 +247,7 @@ class BenchRun:
         self._base = self._next = 0  # frame numbers go on from one renderer to the next
         self._frames: LitFrames | None = None
         self._judge: AnswerJudge | None = None
+        self._bench: Bench | None = None
         self._heard_ns: int | None = None
         self._refused = 0
         self._waiting = False
@@ -284,6 +293,7 @@ class BenchRun:
         if self._frames is None:
             self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
             self._judge = AnswerJudge(self._rules, self._frames)
+        self._bench = bench
         self._base = self._next
         self._light_ns = 0 if screen is None else screen.swap_to_light_ns
         self._file_sha256 = bench.file.sha256
@@ -474,6 +484,17 @@ class BenchRun:
             settled = after_s >= plan.settle_s
         if settled and now.received < plan.asked:
             now.take(judged, right)
+            if right and "stars" in plan.columns and judged.lit is not None:
+                now.star_lists.judged.append(self._judged_stars(answer, judged.lit.q))
+
+    def _judged_stars(self, answer: Answer, lit_q: FloatArray) -> StarResiduals:
+        """The stars of an answer against those that were lit at an attitude."""
+        assert self._bench is not None
+        tracker = self._bench.config.tracker
+        camera = tracker_camera(tracker, self._bench.file.folder)
+        faintest_e_per_s = self._bench.faintest_shown_e_per_s
+        lit = lit_at(lit_q, self._bench.stars, camera, faintest_e_per_s)
+        return judge_stars(answer.centroids, lit, tracker.resolution_px)
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:
         """Whether an answer is of the case on the display; one of the case before that comes
@@ -540,6 +561,9 @@ class BenchRun:
                 "status": NO_ANSWER,
                 "why": "the tracker was silent" if silent else "the tracker had no attitude",
             }
+        row |= now.frames_told.into(self._plan.columns)
+        if "stars" in self._plan.columns:
+            row |= now.star_lists.into()
         return row | spread_row(now.errors)
 
 

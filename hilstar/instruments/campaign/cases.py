@@ -3,9 +3,8 @@ from its answers.
 """
 
 import dataclasses
-import hashlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,38 +17,46 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
 from hilstar.basics.rotation import (
-    conjugate,
     from_radec_roll_deg,
     from_rotation_vector,
     multiply,
     normalise,
     propagate,
     to_radec_roll_deg,
-    to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.campaign.plan import (
     SCENARIO,
     Attitudes,
+    Further,
     Parameter,
     Plan,
     changed_bench,
     parameters,
 )
-from hilstar.instruments.campaign.solver_answer import CentroidErrors, SolverAnswer
 from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.simulate.batch import faulty_exposure, view_at
-from hilstar.instruments.simulate.simulator import Exposure, FaultyExposure, Simulator
+from hilstar.instruments.simulate.simulator import FaultyExposure, Simulator
+from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import BenchFile, dated, stated_in
 from hilstar.server.bench.scenario import Scenario, read_scenario
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
+MAX_STEP_S = 0.01  # of a turn that accelerates
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
 # what varies on a real bench
-ON_BENCH = ("sky", "render", "spacecraft", "rate_deg_s", "time_s", "scenario")
-Kind = Literal["int64", "float64", "bool", "text"]
+ON_BENCH = (
+    "sky",
+    "render",
+    "spacecraft",
+    "rate_deg_s",
+    "acceleration_deg_s2",
+    "time_s",
+    "scenario",
+)
+Kind = Literal["int64", "float64", "bool", "text", "floats"]
 
 DONE, FAILED = "done", "failed"
 AXES = ("x", "y", "z")
@@ -99,6 +106,21 @@ BENCH_AFTER = (
     *(f"{what}_{name}" for what in ("solved", "lit") for name in Q),
     *AFTER[AFTER.index("error_x_arcsec") :],
 )
+# Lists of a value a frame with a right answer, or a star: what [[require]] is judged by, in a plan
+# whose `columns` ask for it.
+FRAME_RATES = tuple(f"frame_rate_{axis}_deg_s" for axis in AXES)
+FRAME_ERRORS = tuple(f"frame_error_{axis}_arcsec" for axis in AXES)
+FRAME_RATE_ERRORS = tuple(f"frame_rate_error_{axis}_deg_s" for axis in AXES)
+STAR_LISTS = (
+    *("star_x_px", "star_y_px", "star_v_mag", "star_bv"),
+    *("star_dx_px", "star_dy_px", "star_signal_mag"),
+)
+REPORTED_FRAMES, FALSE_STARS = "star_frames", "star_false"
+FURTHER: dict[Further, tuple[str, ...]] = {
+    "rate": (*FRAME_RATES, *FRAME_RATE_ERRORS),
+    "time": (*FRAME_RATES, *FRAME_ERRORS),
+    "stars": (REPORTED_FRAMES, FALSE_STARS, *STAR_LISTS),
+}
 RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario
 CENTROIDS = (
     *("stars", "found", "matched", "false", "measured"),
@@ -116,6 +138,13 @@ class Case:
     values: dict[str, Any]
     noise_seed: int
     first: View
+
+    @property
+    def acceleration_rad_s2(self) -> FloatArray:
+        """The angular acceleration (3,), cam."""
+        return np.radians(
+            [float(self.values.get(f"acceleration_deg_s2.{axis}", 0.0)) for axis in AXES]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,11 +224,15 @@ class CaseMaker:
             if not any(key.startswith("rate_deg_s.") for key in case.values):
                 return along
             return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
-        if step_ns:
-            q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S)
+        rate_rad_s = first.turn.rate_cam_rad_s
+        acceleration_rad_s2 = case.acceleration_rad_s2
+        if acceleration_rad_s2.any():
+            q, rate_rad_s = accelerated(first.turn, acceleration_rad_s2, step_ns / NS_PER_S)
+        elif step_ns:
+            q = propagate(first.q_icrs_to_cam, rate_rad_s, step_ns / NS_PER_S)
         else:
             q = first.q_icrs_to_cam
-        return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
+        return View.exposure(q, rate_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
         """The faults of the case's scenario in an exposure, at the case's time or the log's
@@ -248,6 +281,21 @@ class CaseMaker:
             )
         t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
         return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
+
+
+def accelerated(
+    turn: CameraTurn, acceleration_rad_s2: FloatArray, seconds: float
+) -> tuple[FloatArray, FloatArray]:
+    """Attitude (4,) and rate (3,) after turning at a rate that changes at a constant rate, cam
+    components: the midpoint rule in steps of MAX_STEP_S.
+    """
+    q = turn.q_icrs_to_cam
+    steps = max(1, math.ceil(abs(seconds) / MAX_STEP_S))
+    step_s = seconds / steps
+    for step in range(steps):
+        middle_s = (step + 0.5) * step_s
+        q = propagate(q, turn.rate_cam_rad_s + acceleration_rad_s2 * middle_s, step_s)
+    return q, turn.rate_cam_rad_s + acceleration_rad_s2 * seconds
 
 
 def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
@@ -320,7 +368,12 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             )
         if plan.through == "display" and parameter.key == SCENARIO:
             raise InputError(
-                '[[vary]] key = "scenario": faults are of through = "tracker"; write that'
+                f'[[vary]] key = "{parameter.key}": faults are of through = "tracker"; write that'
+            )
+        if plan.attitudes.kind == "log" and table == "acceleration_deg_s2":
+            raise InputError(
+                f'[[vary]] key = "{parameter.key}": with a log the motion is the log\'s; leave it'
+                " out"
             )
         if parameter.key == SCENARIO and not parameter.values:
             raise InputError(
@@ -335,14 +388,17 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             )
 
 
-def bench_columns(parameters: list[Parameter]) -> dict[str, Kind]:
+def bench_columns(
+    parameters: list[Parameter], further: tuple[Further, ...] = ()
+) -> dict[str, Kind]:
     """The columns of the rows of a campaign on the bench, in their order."""
     names = columns(parameters, False)
     varied = [name for name in names if name.startswith("vary.")]
     kinds = {name: columns_kind(name) for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER)} | {
         "stars": "float64"
     }
-    return kinds | {name: names[name] for name in (*varied, *RECOVERY) if name in names}
+    kinds |= {name: names[name] for name in (*varied, *RECOVERY) if name in names}
+    return kinds | further_columns(further)
 
 
 def columns_kind(name: str) -> Kind:
@@ -354,14 +410,24 @@ def columns_kind(name: str) -> Kind:
     return "float64"
 
 
-def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind]:
+def columns(
+    parameters: list[Parameter], with_centroids: bool, further: tuple[Further, ...] = ()
+) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
     found: dict[str, Kind] = {}
     recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
     for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
         found[name] = varied.get(name) or columns_kind(name)
-    return found
+    return found | further_columns(further)
+
+
+def further_columns(further: tuple[Further, ...]) -> dict[str, Kind]:
+    """The columns that a plan's `columns` ask for."""
+    kinds: dict[str, Kind] = {}
+    for name in (name for part in further for name in FURTHER[part]):
+        kinds[name] = "int64" if name in (REPORTED_FRAMES, FALSE_STARS) else "floats"
+    return kinds
 
 
 def value_kind(parameter: Parameter) -> Kind:
@@ -399,118 +465,3 @@ def first_row(case: Case, plan_columns: dict[str, Kind]) -> Row:
 def failed(row: Row, why: str) -> Row:
     """The row of a case that failed."""
     return row | {"status": FAILED, "why": why}
-
-
-def spread_row(errors_arcsec: list[FloatArray]) -> Row:
-    """The mean of a case's errors (3,), and their standard deviation where there are several."""
-    row: Row = {}
-    if errors_arcsec:
-        errors = np.array(errors_arcsec)
-        row |= {
-            f"error_{axis}_arcsec": float(value)
-            for axis, value in zip(AXES, errors.mean(axis=0), strict=True)
-        }
-        if len(errors) > 1:
-            scatter = errors.std(axis=0, ddof=1)
-            row |= {
-                f"scatter_{axis}_arcsec": float(value)
-                for axis, value in zip(AXES, scatter, strict=True)
-            }
-    return row
-
-
-@dataclass(slots=True)
-class CaseTally:
-    """The exposures and answers of a case so far."""
-
-    with_centroids: bool
-    wrong_above_arcsec: float
-    fault_end_s: float | None = None
-    first_attitude_s: float | None = None
-    recovery_s: float | None = None
-    frames: int = 0
-    stars_in_view: int = 0
-    errors_arcsec: list[FloatArray] = field(default_factory=list)
-    why: str = ""
-    star_errors: list[CentroidErrors] = field(default_factory=list)
-    wrong: int = 0
-    first_q: FloatArray | None = None
-    _digest: Any = field(default_factory=hashlib.sha256)
-
-    def see(self, exposure: Exposure) -> None:
-        """Count an exposure."""
-        self.frames += 1
-        self.stars_in_view += len(exposure.truth)
-        self._digest.update(np.ascontiguousarray(exposure.dn))
-
-    def hear(self, exposure: Exposure, answer: SolverAnswer, end_s: float) -> None:
-        """Count the answer to an exposure that ends so long after the case's begin."""
-        if answer.star_errors is not None:
-            self.star_errors.append(answer.star_errors)
-        if answer.q_icrs_to_cam is None:
-            self.why = self.why or answer.why
-            return
-        error = attitude_error_arcsec(exposure.view.q_icrs_to_cam, answer.q_icrs_to_cam)
-        if self.frames == 1:
-            self.first_q = answer.q_icrs_to_cam
-        if np.linalg.norm(error) > self.wrong_above_arcsec:
-            self.wrong += 1
-        else:
-            self.errors_arcsec.append(error)
-            self.first_attitude_s = (
-                end_s if self.first_attitude_s is None else self.first_attitude_s
-            )
-            if (
-                self.fault_end_s is not None
-                and self.recovery_s is None
-                and end_s - exposure.view.exposure_s / 2 >= self.fault_end_s
-            ):
-                self.recovery_s = end_s - self.fault_end_s
-
-    def into(self, row: Row) -> Row:
-        """The case's row with its results. Errors are those of answers that are not wrong."""
-        row = row | {
-            "why": self.why,
-            "image_sha256": self._digest.hexdigest(),
-            "frames": self.frames,
-        }
-        row |= {
-            "stars_in_view": self.stars_in_view,
-            "solved": self.wrong + len(self.errors_arcsec),
-            "wrong": self.wrong,
-        }
-        row["first_attitude_s"] = self.first_attitude_s
-        if "recovery_s" in row:
-            row |= {"fault_end_s": self.fault_end_s, "recovery_s": self.recovery_s}
-        if self.first_q is not None:
-            row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
-        row |= spread_row(self.errors_arcsec)
-        if self.with_centroids and self.star_errors:
-            return row | self._centroids()
-        return row
-
-    def _centroids(self) -> Row:
-        dx_px, dy_px = (
-            np.concatenate([getattr(star_errors, name) for star_errors in self.star_errors])
-            for name in ("dx_px", "dy_px")
-        )
-        v_mag = np.concatenate([star_errors.v_mag for star_errors in self.star_errors])
-        row: Row = {
-            name: sum(getattr(star_errors, name) for star_errors in self.star_errors)
-            for name in ("stars", "found", "matched", "false")
-        }
-        row["measured"] = len(dx_px)
-        if len(dx_px):
-            row |= {"centroid_dx_px": float(dx_px.mean()), "centroid_dy_px": float(dy_px.mean())}
-            row["limit_v_mag"] = float(v_mag.max())
-        if len(dx_px) > 1:
-            row |= {
-                "centroid_sigma_x_px": float(dx_px.std(ddof=1)),
-                "centroid_sigma_y_px": float(dy_px.std(ddof=1)),
-            }
-        return row
-
-
-def attitude_error_arcsec(q_commanded: FloatArray, q_reported: FloatArray) -> FloatArray:
-    """The rotation vector (3,), arcsec, cam axes, from the commanded to the reported attitude."""
-    return to_rotation_vector(multiply(q_reported, conjugate(q_commanded))) * ARCSEC_PER_RAD

@@ -44,7 +44,7 @@ DEFAULT_ANSWERS, DEFAULT_TIMEOUT_S = 5, 10.0
 MAX_BENCH_CASES = 1_000_000
 # for through = "bench" alone
 BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")
-TRACKER_KEYS = ("frames", "step_s", "noise", "centroids")  # for the others
+TRACKER_KEYS = ("frames", "step_s", "noise", "centroids", "planted")  # for the others
 
 Sampling = Literal["grid", "latin-hypercube", "sobol"]
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -56,16 +56,20 @@ Roll = Annotated[float, Meta(ge=-360, le=720)]
 # `misalignment_arcsec` turns the display's true mounting, cam axes.
 OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
+    *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
     *("time_s", "noise_seed", "scenario"),
 )
 MAX_OWN = {
     "rate_deg_s": 360.0,
+    "acceleration_deg_s2": 360.0,
     "misalignment_arcsec": 36_000.0,
     "time_s": 9e9,
     "noise_seed": 2.0**63 - 1,
 }
 WHOLE = ("noise_seed",)
+# Further columns of the table, lists of a value a frame or a star.
+Further = Literal["rate", "time", "stars"]
 # What [[require]] limits (ECSS-E-ST-60-20C), and its unit; those of an axis, arcsec, come first.
 Quantity = Literal[
     "bias",
@@ -77,11 +81,42 @@ Quantity = Literal[
     "wrong-rate",
     "time-to-first-attitude",
     "recovery",
+    "no-attitude",
+    "false-attitude",
+    "rate-bias",
+    "rate-noise",
+    "rate-scale",
+    "rate-lag",
+    "time-bias",
+    "time-jitter",
+    "aberration",
+    "star-noise",
+    "star-fov-error",
+    "star-colour",
+    "star-limit",
+    "false-stars",
+    "edge",
 ]
 AXIS_QUANTITIES = ("bias", "fov-error", "pixel-error", "noise", "nea")
+RATE_QUANTITIES = ("rate-bias", "rate-noise", "rate-scale", "rate-lag")
+WITH_AXIS = (*AXIS_QUANTITIES, *RATE_QUANTITIES)
 TIME_QUANTITIES = ("time-to-first-attitude", "recovery")
+SHARE_QUANTITIES = ("availability", "wrong-rate", "no-attitude", "false-attitude")
+STAR_QUANTITIES = ("star-noise", "star-fov-error", "star-colour", "star-limit", "false-stars")
+# These take `share`: the quantile of so many cases.
+WITH_SHARE = ("fov-error", "pixel-error", "noise", "nea", *TIME_QUANTITIES)
 QUANTITY_UNITS = dict.fromkeys(AXIS_QUANTITIES, "arcsec") | dict.fromkeys(TIME_QUANTITIES, "s")
-QUANTITY_UNITS |= {"availability": "", "wrong-rate": ""}
+QUANTITY_UNITS |= dict.fromkeys(SHARE_QUANTITIES, "")
+QUANTITY_UNITS |= {"rate-bias": "deg/s", "rate-noise": "deg/s", "rate-scale": "", "rate-lag": "s"}
+QUANTITY_UNITS |= {"time-bias": "s", "time-jitter": "s", "aberration": ""}
+QUANTITY_UNITS |= {"star-noise": "px", "star-fov-error": "px", "star-colour": "mag/mag"}
+QUANTITY_UNITS |= {"star-limit": "mag", "false-stars": "a frame", "edge": ""}
+# The further columns that a quantity is found from.
+QUANTITY_COLUMNS: dict[str, Further] = {
+    **dict.fromkeys(RATE_QUANTITIES, "rate"),
+    **dict.fromkeys(("time-bias", "time-jitter", "aberration"), "time"),
+    **dict.fromkeys(STAR_QUANTITIES, "stars"),
+}
 CONDITION = re.compile(
     r"\s*([A-Za-z0-9_.]+)\s*(<=|>=|==|!=|<|>)\s*(?:\"([^\"]*)\"|([-+0-9.eE]+))\s*"
 )
@@ -156,9 +191,14 @@ class Require(Table, frozen=True):
         return 0.0 if limit is None else limit
 
     @property
+    def unit(self) -> str:
+        """The unit of its quantity."""
+        return QUANTITY_UNITS[self.quantity]
+
+    @property
     def of_axis(self) -> bool:
         """Whether its quantity has an axis."""
-        return self.quantity in AXIS_QUANTITIES
+        return self.quantity in WITH_AXIS
 
     @property
     def words(self) -> str:
@@ -177,6 +217,34 @@ class Require(Table, frozen=True):
         return (
             f"{self.quantity}{axis} {side} {self.limit:g}{f' {unit}' if unit else ''}{share}{where}"
         )
+
+
+class PlantedFaults(Table, frozen=True):
+    """[planted]: what is wrong with the virtual tracker on purpose, so that a plan shows that it
+    finds it. Arcsec, deg/s about cam x, y, z; s; shares of frames.
+    """
+
+    bias_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    noise_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    lost_roll: bool = False
+    wrong: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    missing: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    acquisition_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    recovery_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    max_rate_deg_s: Annotated[float, Meta(ge=0, le=1e6)] | None = None
+    max_false_stars: Annotated[int, Meta(ge=0, le=100_000)] | None = None
+    rate_bias_deg_s: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    rate_noise_deg_s: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    rate_scale: Number = 0.0
+    rate_lag_s: Number = 0.0
+    stamp_bias_s: Number = 0.0
+    stamp_jitter_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    aberration: Number = 0.0
+    star_noise_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
+    star_fov_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
+    star_colour: Number = 0.0
+    star_limit_v_mag: Number | None = None
+    false_stars: Annotated[float, Meta(ge=0, le=1000)] = 0.0
 
 
 class Plan(Table, frozen=True):
@@ -199,6 +267,8 @@ class Plan(Table, frozen=True):
     check_every: Annotated[int, Meta(ge=0, le=MAX_CASES)] = 0
     attitudes: Attitudes = msgspec.field(default_factory=Attitudes)
     centroids: Centroiding = msgspec.field(default_factory=Centroiding)
+    columns: tuple[Further, ...] = ()
+    planted: PlantedFaults | None = None
     vary: Annotated[list[Varied], Meta(max_length=64)] = msgspec.field(default_factory=list)
     require: Annotated[list[Require], Meta(max_length=256)] = msgspec.field(default_factory=list)
 
@@ -253,8 +323,7 @@ def parse_plan(path: Path, text: str) -> Plan:
                     f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out'
                 )
             _check_range(varied, plan.sampling)
-        for number, require in enumerate(plan.require, start=1):
-            _check_require(f"[[require]] number {number}", require)
+        _check_requires(plan.require)
         if plan.cases is None and plan.sampling != "grid":
             raise InputError(
                 f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000'
@@ -331,18 +400,29 @@ def _check_range(varied: Varied, sampling: Sampling) -> None:
         raise InputError(f'{where}: steps is for sampling = "grid"; leave it out')
 
 
-def _check_require(where: str, require: Require) -> None:
+def _check_requires(requires: list[Require]) -> None:
+    for number, require in enumerate(requires, start=1):
+        if require.quantity == "edge":
+            raise InputError(
+                f"[[require]] number {number} (edge): is of a sweep; write it as a [[clause]] of a"
+                " plan for hilstar accept"
+            )
+        check_require(f"[[require]] number {number}", require)
+
+
+def check_require(where: str, require: Require) -> None:
+    """Refuse (InputError) a requirement whose keys do not go together."""
     quantity = require.quantity
     where = f"{where} ({quantity})"
     if (require.maximum is None) == (require.minimum is None):
         raise InputError(f"{where}: write either maximum or minimum, a number")
     if require.axis is not None and not require.of_axis:
         raise InputError(f"{where}: has no axis; leave axis out")
-    if require.share is not None and quantity in ("bias", "availability", "wrong-rate"):
+    if require.share is not None and quantity not in WITH_SHARE:
         raise InputError(
             f"{where}: is one figure of all cases, without a share of them; leave share out"
         )
-    if quantity in ("availability", "wrong-rate") and not 0 <= require.limit <= 1:
+    if quantity in SHARE_QUANTITIES and not 0 <= require.limit <= 1:
         raise InputError(f"{where}: the limit {require.limit:g}; write a share from 0 to 1")
     try:
         conditions_of(require.condition)

@@ -12,6 +12,7 @@ shown**; a minimum the other way round. The limits:
 - quantiles (a time, or an error with `share`) by order statistics, free of any distribution. A case
   that never had an attitude
   has an infinite time;
+- what answers carry beside the attitude as answer_figures.py has it;
 - a bias by Student's t, across the boresight the larger of x and y;
 - a sigma by chi-square where the errors pass for Gaussian (kurtosis at 1 %), else by the bootstrap
   over blocks of cases;
@@ -35,7 +36,22 @@ from hilstar.basics.errors import InputError
 from hilstar.instruments.assess.budget import Decomposed, assess_cases
 from hilstar.instruments.assess.components import HARMONICS, SURE_OF_MANY, Component
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.plan import Require, checked_conditions
+from hilstar.instruments.campaign.answer_figures import answer_figure
+from hilstar.instruments.campaign.figures import (
+    BoundedFigure,
+    TooFewCases,
+    clopper_pearson,
+    drawn_limits,
+    quantile_limits,
+    sigma_limits,
+)
+from hilstar.instruments.campaign.plan import (
+    AXIS_QUANTITIES,
+    QUANTITY_COLUMNS,
+    SHARE_QUANTITIES,
+    Require,
+    checked_conditions,
+)
 from hilstar.instruments.campaign.results import MAX_FITTED_CASES, Columns, attitudes_of
 
 AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
@@ -51,7 +67,6 @@ COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
 }
 MET, NOT_MET, NOT_SHOWN = "met", "not met", "not shown"
 TIME_SHARE = 0.95  # a time's share where `share` is not given
-MAX_BLOCKS, DRAWS = 200, 1000  # the bootstrap's
 MIN_TESTED, GAUSSIAN_P = 20, 0.01  # values, and the probability below which they are not Gaussian
 MAX_MORE = 10_000_000  # cases: more are not worth a figure
 WAVE_COLUMNS = 2 * len(HARMONICS)
@@ -59,8 +74,9 @@ WAVE_COLUMNS = 2 * len(HARMONICS)
 
 @dataclass(frozen=True, slots=True)
 class RequirementVerdict:
-    """A requirement's verdict. `value` is the figure itself, None where it is not known, and
-    `more` the cases still wanted.
+    """A requirement's verdict. `value` is the figure itself, None where it is not known, `low` and
+    `high` its one-sided limits, `guard` what the limit was narrowed by for the bench, and `more`
+    the cases still wanted.
     """
 
     require: Require
@@ -70,6 +86,22 @@ class RequirementVerdict:
     verdict: str
     more: int | None
     method: str
+    low: float | None = None
+    high: float | None = None
+    guard: float = 0.0
+
+    @property
+    def margin(self) -> float | None:
+        """How far the bound keeps the limit, less the guard band; negative where it does not. None
+        where the figure is not known.
+        """
+        if self.require.minimum is None:
+            if self.high is None:
+                return None
+            return self.require.limit - self.guard - self.high
+        if self.low is None:
+            return None
+        return self.low - self.require.limit - self.guard
 
     @property
     def words(self) -> str:
@@ -92,43 +124,19 @@ class RequirementVerdict:
         return verdict_text
 
 
-@dataclass(frozen=True, slots=True)
-class _Figure:
-    """A figure with its one-sided limits; `rate` (count, of) is what decides how many cases are
-    wanted.
-    """
-
-    value: float
-    low: float
-    high: float
-    cases: int
-    method: str
-    rate: tuple[float, float] | None = None
-
-
-class _TooFew(Exception):
-    """Why a figure is not known, with how many more cases could give it (None: cases alone
-    cannot).
-    """
-
-    def __init__(self, why: str, cases: int, more: int | None = None) -> None:
-        super().__init__(why)
-        self.cases = cases
-        self.more = more
-
-
 def verdicts_of(
     requires: list[Require],
     cases: Columns,
     scale: Scale,
     seed: int,
     bench_arcsec: tuple[float, float] | None = None,
+    bench_s: float = 0.0,
 ) -> list[RequirementVerdict]:
     """The verdict of each requirement over the cases. Raises InputError for a condition on a column
     that is not there.
 
-    `bench_arcsec` is how far the bench's own attitude may be off, across and about: it is taken off
-    an error's limit.
+    `bench_arcsec` is how far the bench's own attitude may be off, across and about, and `bench_s`
+    its own time: that is taken off an error's limit.
     """
     cases = cases.some(
         np.arange(len(cases.numbers["frames"]))
@@ -148,7 +156,7 @@ def verdicts_of(
         decomposition = decomposed[condition]
         if isinstance(decomposition, InputError):
             answers = int(np.isfinite(some.numbers["error_x_arcsec"]).sum())
-            raise _TooFew(str(decomposition), answers, max(30 - answers, 0) or None)
+            raise TooFewCases(str(decomposition), answers, max(30 - answers, 0) or None)
         return decomposition
 
     verdicts = []
@@ -157,14 +165,18 @@ def verdicts_of(
         some = cases.some(chosen)
         try:
             figure = _figure(
-                require, some, partial(parts, require.condition, some), np.random.default_rng(seed)
+                require,
+                some,
+                partial(parts, require.condition, some),
+                scale.resolution_px,
+                np.random.default_rng(seed),
             )
-        except _TooFew as few:
+        except TooFewCases as few:
             verdicts.append(
                 RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, str(few))
             )
             continue
-        verdicts.append(_judged(require, figure, bench_arcsec))
+        verdicts.append(judged_figure(require, figure, bench_arcsec, bench_s))
     return verdicts
 
 
@@ -184,15 +196,23 @@ def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:
     return chosen
 
 
-def _judged(
-    require: Require, figure: _Figure, bench_arcsec: tuple[float, float] | None
+def judged_figure(
+    require: Require,
+    figure: BoundedFigure,
+    bench_arcsec: tuple[float, float] | None = None,
+    bench_s: float = 0.0,
 ) -> RequirementVerdict:
+    """The verdict on a figure; the bench's own error narrows the limit (see `verdicts_of`)."""
     limit, maximum = require.limit, require.minimum is None
     own = 0.0  # what of the error the bench could have made, or hidden
-    if bench_arcsec is not None and require.of_axis and maximum:
+    if bench_arcsec is not None and require.quantity in AXIS_QUANTITIES and maximum:
         own = bench_arcsec[1 if AXIS_INDICES[require.axis or "cross"] == [2] else 0]
         share = f"{100 * min(own / figure.value, 1.0):.0f} %" if figure.value > 0 else "all"
         told = f"{own:.2g} arcsec taken off for the bench, which could have made {share} of it"
+        figure = replace(figure, method=f"{figure.method}; {told}")
+    if bench_s and require.quantity == "time-bias" and maximum:
+        own = bench_s
+        told = f"{own:.2g} s taken off for the bench"
         figure = replace(figure, method=f"{figure.method}; {told}")
     met = figure.high <= limit - own if maximum else figure.low >= limit
     missed = figure.low > limit + own if maximum else figure.high < limit
@@ -208,10 +228,13 @@ def _judged(
         verdict,
         more,
         figure.method,
+        figure.low if math.isfinite(figure.low) else None,
+        figure.high if math.isfinite(figure.high) else None,
+        own,
     )
 
 
-def _more(require: Require, figure: _Figure) -> int | None:
+def _more(require: Require, figure: BoundedFigure) -> int | None:
     """How many more cases would decide, if the figure stays as it is; None where no number of
     cases would.
     """
@@ -221,9 +244,7 @@ def _more(require: Require, figure: _Figure) -> int | None:
     if figure.rate is not None:
         count, of = figure.rate
         share = count / of
-        allowed = (
-            limit if require.quantity in ("availability", "wrong-rate") else 1 - _share(require)
-        )
+        allowed = limit if require.quantity in SHARE_QUANTITIES else 1 - _share(require)
 
         def decided(cases: int) -> bool:
             n = cases * of / figure.cases
@@ -261,25 +282,46 @@ def _share(require: Require) -> float:
 
 
 def _figure(
-    require: Require, cases: Columns, parts: Callable[[], Decomposed], rng: np.random.Generator
-) -> _Figure:
+    require: Require,
+    cases: Columns,
+    parts: Callable[[], Decomposed],
+    resolution_px: tuple[int, int],
+    rng: np.random.Generator,
+) -> BoundedFigure:
     quantity = require.quantity
     c = require.confidence
     axes = AXIS_INDICES[require.axis or "cross"]
     count = len(cases.numbers["frames"])
     if not count:
-        raise _TooFew("no case meets its condition", 0)
-    if quantity in ("availability", "wrong-rate"):
-        solved, wrong = (np.nan_to_num(cases.numbers[name]) for name in ("solved", "wrong"))
-        asked = np.nan_to_num(cases.numbers["frames"])
-        if quantity == "wrong-rate":
-            return _rate(wrong, solved, c)
-        return _rate(solved - wrong, asked, c)
+        raise TooFewCases("no case meets its condition", 0)
+    if quantity in QUANTITY_COLUMNS:
+        return answer_figure(require, cases, axes, resolution_px, rng)
+    if quantity in SHARE_QUANTITIES:
+        return _rate(*_share_of(quantity, cases), c)
     if quantity in ("time-to-first-attitude", "recovery"):
         return _time(require, cases)
     if quantity == "nea" and np.nansum(cases.numbers["frames"] > 1):
         return _within(cases, axes, require, rng)
-    components = parts()
+    return _decomposed(require, parts(), axes, rng)
+
+
+def _share_of(quantity: str, cases: Columns) -> tuple[FloatArray, FloatArray]:
+    """What is counted in each case (n,), and among how many (n,)."""
+    solved, wrong = (np.nan_to_num(cases.numbers[name]) for name in ("solved", "wrong"))
+    asked = np.nan_to_num(cases.numbers["frames"])
+    shares = {
+        "wrong-rate": (wrong, solved),
+        "false-attitude": (wrong, asked),
+        "no-attitude": (asked - solved, asked),
+        "availability": (solved - wrong, asked),
+    }
+    return shares[quantity]
+
+
+def _decomposed(
+    require: Require, components: Decomposed, axes: list[int], rng: np.random.Generator
+) -> BoundedFigure:
+    """A figure of the error budget, and the wild answers that it leaves out."""
     figure = _of_parts(components, axes, require, rng)
     if len(components.wrong):
         return replace(
@@ -290,7 +332,7 @@ def _figure(
 
 def _of_parts(
     found: Decomposed, axes: list[int], require: Require, rng: np.random.Generator
-) -> _Figure:
+) -> BoundedFigure:
     """A figure of the error budget's parts."""
     quantity = require.quantity
     c = require.confidence
@@ -309,33 +351,18 @@ def _of_parts(
     else:
         part = components.pixel
     if part.reason:
-        raise _TooFew(part.reason, n)
+        raise TooFewCases(part.reason, n)
     return _repeating(part, components.noise_variance, axes, require, rng)
 
 
-def clopper_pearson(count: float, of: float, confidence: float) -> tuple[float, float]:
-    """The one-sided limits of a rate of which `count` in `of` were seen, each at this
-    confidence.
-    """
-    if count <= 0:
-        low = 0.0
-    else:
-        low = float(stats.beta.ppf(1 - confidence, count, of - count + 1))
-    if count >= of:
-        high = 1.0
-    else:
-        high = float(stats.beta.ppf(confidence, count + 1, of - count))
-    return low, high
-
-
-def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> _Figure:
+def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> BoundedFigure:
     """The rate of hits (n,) among what was asked (n,) of each case."""
     hits = hits[asked > 0]
     asked = asked[asked > 0]
     cases = len(asked)
     total = float(asked.sum())
     if not cases:
-        raise _TooFew("there is no answer", 0)
+        raise TooFewCases("there is no answer", 0)
     share = float(hits.sum()) / total
     effective = total
     method = "Clopper-Pearson"
@@ -348,34 +375,19 @@ def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> _Figure:
             effective = max(total / effect, 1.0)
             method = f"Clopper-Pearson, design effect {effect:.3g}"
     low, high = clopper_pearson(share * effective, effective, confidence)
-    return _Figure(share, low, high, cases, method, (share * effective, effective))
+    return BoundedFigure(share, low, high, cases, method, (share * effective, effective))
 
 
-def quantile_limits(values: FloatArray, share: float, confidence: float) -> tuple[float, float]:
-    """One-sided limits of the `share` quantile of values (n,) by order statistics; infinite
-    where there are too few.
-    """
-    ordered = np.sort(values)
-    n = len(values)
-    # the smallest k with P(count <= k) >= confidence
-    upper = int(stats.binom.ppf(confidence, n, share))
-    lower = int(stats.binom.ppf(1 - confidence, n, share))
-    lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
-    return float(ordered[lower - 1]) if lower > 0 else -math.inf, (
-        float(ordered[upper]) if upper < n else math.inf
-    )
-
-
-def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> _Figure:
+def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> BoundedFigure:
     share = _share(require)
     low, high = quantile_limits(values, share, require.confidence)
     ordered = np.sort(values)
     value = float(ordered[min(math.ceil(share * len(values)), len(values)) - 1])
     beyond = float((values > require.limit).sum())
-    return _Figure(value, max(low, 0.0), high, cases, method, (beyond, float(len(values))))
+    return BoundedFigure(value, max(low, 0.0), high, cases, method, (beyond, float(len(values))))
 
 
-def _time(require: Require, cases: Columns) -> _Figure:
+def _time(require: Require, cases: Columns) -> BoundedFigure:
     numbers = cases.numbers
     column, known = (
         ("first_attitude_s", "frames")
@@ -387,32 +399,29 @@ def _time(require: Require, cases: Columns) -> _Figure:
             why = "the table has no such column: a plan that varies scenario has"
         else:
             why = "no such column"
-        raise _TooFew(f"{column}: {why}", 0)
+        raise TooFewCases(f"{column}: {why}", 0)
     is_timed = np.isfinite(numbers[known])
     if not is_timed.any():
-        raise _TooFew("no fault ended within a case", 0)
+        raise TooFewCases("no fault ended within a case", 0)
     times = np.where(np.isfinite(numbers[column]), numbers[column], math.inf)[is_timed]
     return _quantile(times, require, len(times), "order statistics")
 
 
-def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> _Figure:
+def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> BoundedFigure:
     standard = sigma / math.sqrt(n)
     size = np.abs(mean)
     upper = stats.t.ppf(confidence, n - 1)
     # Bonferroni: of several axes any one may be the larger
     lower = stats.t.ppf(1 - (1 - confidence) / len(size), n - 1)
     low = max(float((size - lower * standard).max()), 0.0)
-    return _Figure(float(size.max()), low, float((size + upper * standard).max()), n, "Student's t")
-
-
-def _sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[float, float]:
-    low, high = (
-        variance * freedom / stats.chi2.ppf(p, freedom) for p in (confidence, 1 - confidence)
+    return BoundedFigure(
+        float(size.max()), low, float((size + upper * standard).max()), n, "Student's t"
     )
-    return math.sqrt(low), math.sqrt(high)
 
 
-def _noise(left: FloatArray, freedom: float, require: Require, rng: np.random.Generator) -> _Figure:
+def _noise(
+    left: FloatArray, freedom: float, require: Require, rng: np.random.Generator
+) -> BoundedFigure:
     """The noise of errors (n, axes) that already have the spread of the noise itself."""
     n = len(left)
     c = require.confidence
@@ -422,19 +431,21 @@ def _noise(left: FloatArray, freedom: float, require: Require, rng: np.random.Ge
     freedom = max(freedom, 1.0)
     # Few values cannot show that they are not Gaussian.
     if n < MIN_TESTED or float(stats.kurtosistest(left.ravel()).pvalue) > GAUSSIAN_P:
-        low, high = _sigma_limits(variance, freedom * left.shape[1], c)
-        return _Figure(math.sqrt(variance), low, high, n, "chi-square, Gaussian")
-    low, high = np.sqrt(_drawn((left**2).mean(axis=1), np.ones(n), rng, c))
-    return _Figure(math.sqrt(variance), float(low), float(high), n, "bootstrap, not Gaussian")
+        low, high = sigma_limits(variance, freedom * left.shape[1], c)
+        return BoundedFigure(math.sqrt(variance), low, high, n, "chi-square, Gaussian")
+    low, high = np.sqrt(drawn_limits((left**2).mean(axis=1), np.ones(n), rng, c))
+    return BoundedFigure(math.sqrt(variance), float(low), float(high), n, "bootstrap, not Gaussian")
 
 
-def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Generator) -> _Figure:
+def _within(
+    cases: Columns, axes: list[int], require: Require, rng: np.random.Generator
+) -> BoundedFigure:
     """The noise between the frames of a case, over all cases."""
     scatter = cases.vectors("scatter_{}_arcsec", "xyz")[:, axes]
     answers = cases.numbers["solved"] - cases.numbers["wrong"]
     some = np.isfinite(scatter).all(axis=1) & (answers > 1)
     if not some.any():
-        raise _TooFew("no case has two right answers", 0)
+        raise TooFewCases("no case has two right answers", 0)
     square = (scatter[some] ** 2).mean(axis=1)
     freedom = answers[some] - 1
     variance = float(square @ freedom / freedom.sum())
@@ -447,23 +458,13 @@ def _within(cases: Columns, axes: list[int], require: Require, rng: np.random.Ge
     excess = float((freedom * len(axes) * (square / max(variance, 1e-300) - 1) ** 2).mean()) / 2 - 1
     # 14: the variance of that square, one degree of freedom a case
     if n < MIN_TESTED or excess < 3 * math.sqrt(14 / n):
-        low, high = _sigma_limits(variance, float(freedom.sum()) * len(axes), require.confidence)
+        low, high = sigma_limits(variance, float(freedom.sum()) * len(axes), require.confidence)
     else:
-        low, high = np.sqrt(_drawn(square * freedom, freedom, rng, require.confidence)).tolist()
+        low, high = np.sqrt(
+            drawn_limits(square * freedom, freedom, rng, require.confidence)
+        ).tolist()
         method = "bootstrap, not Gaussian"
-    return _Figure(factor * math.sqrt(variance), factor * low, factor * high, n, method)
-
-
-def _drawn(
-    sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float
-) -> FloatArray:
-    """The limits (2,) of sum over weight of cases (n,), by the bootstrap over blocks of them."""
-    blocks = min(MAX_BLOCKS, len(sums))
-    block = np.arange(len(sums)) * blocks // len(sums)
-    total, weight = (np.bincount(block, values, blocks) for values in (sums, weights))
-    drawn = rng.integers(0, blocks, (DRAWS, blocks))
-    ratio = total[drawn].sum(axis=1) / np.maximum(weight[drawn].sum(axis=1), 1e-300)
-    return np.asarray(np.quantile(ratio, [1 - confidence, confidence]))
+    return BoundedFigure(factor * math.sqrt(variance), factor * low, factor * high, n, method)
 
 
 def _repeating(
@@ -472,14 +473,16 @@ def _repeating(
     axes: list[int],
     require: Require,
     rng: np.random.Generator,
-) -> _Figure:
+) -> BoundedFigure:
     n = len(part.fitted)
     c = require.confidence
     noise = float(noise_variance[axes].mean())
     variance = float(part.variance[axes].mean())
     taken = part.freedom / n * noise
     square = (part.fitted[:, axes] ** 2).mean(axis=1)
-    low, high = (max(bound - taken, 0.0) for bound in _drawn(square, np.ones(n), rng, c).tolist())
+    low, high = (
+        max(bound - taken, 0.0) for bound in drawn_limits(square, np.ones(n), rng, c).tolist()
+    )
     if part.freedom:  # the noise in the fit: its own power, and what it adds to that of the part
         power = noise * (2 * part.freedom * noise / n + 4 * variance) / (n * len(axes))
         hidden = float(stats.norm.ppf(c)) * math.sqrt(power)
@@ -495,6 +498,6 @@ def _repeating(
         factor = float(np.quantile(size, require.share)) / math.sqrt(float((size**2).mean()))
     elif require.share is not None:
         factor = float(stats.norm.ppf((1 + require.share) / 2))
-    return _Figure(
+    return BoundedFigure(
         factor * math.sqrt(variance), factor * math.sqrt(low), factor * math.sqrt(high), n, method
     )

@@ -16,7 +16,7 @@ no parameter costs.
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from hilstar.instruments.assess.figure_rows import (
     part_rows,
 )
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.page import PAGE_FILE, write_campaign_page
+from hilstar.instruments.campaign.page import PAGE_FILE, MeasureCosts, write_campaign_page
 from hilstar.instruments.campaign.store import failures, file_sha256
 from hilstar.server.bench.bench_file import BenchFile
 
@@ -64,13 +64,14 @@ MAX_REASONS = 5
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns (n,) by name: numbers as float64 with NaN where there are none, and text. `cases`
-    counts the whole table's.
+    """Columns (n,) by name: numbers as float64 with NaN where there are none, text, and lists of
+    numbers (k,). `cases` counts the whole table's.
     """
 
     cases: int
     numbers: dict[str, FloatArray]
     texts: dict[str, list[str]]
+    lists: dict[str, list[FloatArray]] = field(default_factory=dict)
 
     @property
     def varied(self) -> list[str]:
@@ -84,7 +85,11 @@ class Columns:
             name: [text for text, is_one in zip(column, chosen, strict=True) if is_one]
             for name, column in self.texts.items()
         }
-        return Columns(self.cases, numbers, texts)
+        lists = {
+            name: [values for values, is_one in zip(column, chosen, strict=True) if is_one]
+            for name, column in self.lists.items()
+        }
+        return Columns(self.cases, numbers, texts, lists)
 
     def vectors(self, form: str, names: str) -> FloatArray:
         """Columns (n, k) side by side: `form` with each of `names` in it."""
@@ -98,6 +103,7 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
 
     numbers: dict[str, list[FloatArray]] = {}
     texts: dict[str, list[str]] = {}
+    lists: dict[str, list[FloatArray]] = {}
     try:
         file = pq.ParquetFile(path)
         step = -(-file.metadata.num_rows // max_cases) or 1
@@ -108,6 +114,10 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
                 column: Any = table.column(name)
                 if pa.types.is_string(column.type):
                     texts.setdefault(name, []).extend(value or "" for value in column.to_pylist())
+                elif pa.types.is_list(column.type):
+                    lists.setdefault(name, []).extend(
+                        np.array(values or [], dtype=np.float64) for values in column.to_pylist()
+                    )
                 else:
                     values = np.array(
                         [np.nan if v is None else float(v) for v in column.to_pylist()]
@@ -117,6 +127,7 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
             file.metadata.num_rows,
             {name: np.concatenate(parts) for name, parts in numbers.items()},
             texts,
+            lists,
         )
     except (OSError, pa.ArrowException, ValueError) as error:
         raise InputError(
@@ -392,14 +403,9 @@ def finding(found: list[Cost]) -> str:
             f" {_figure(first.overall, first)} in the median"
         )
 
-    def at(k: int) -> str:
-        place = first.places[k]
-        return (
-            f"{_figure(float(first.level[k]), first)} at"
-            f" {place if isinstance(place, str) else f'{place:.3g}'}"
-        )
-
-    return f"{first.parameter} costs the most of the {what}: {at(first.best)}, {at(first.worst)}"
+    smallest = _level_text(first, first.best)
+    largest = _level_text(first, first.worst)
+    return f"{first.parameter} costs the most of the {what}: {smallest}, {largest}"
 
 
 def _figure(value: float, cost: Cost) -> str:
@@ -430,6 +436,31 @@ def cost_chart(found: list[Cost]) -> Any:
             axis.set_xlabel(f"{cost.parameter}: costs {_figure(cost.cost, cost)}{sure}")
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
     return axes[0].figure
+
+
+def page_costs(found: list[Cost], figure: Any) -> MeasureCosts:
+    """The costs of one measure for the page, with their chart."""
+    first = found[0]
+    of = f"cost of {first.parameter}"
+    if not first.sure:
+        of = f"{of}: no more than the cases' noise"
+    rows = []
+    for cost in found:
+        text = _figure(cost.cost, cost)
+        if not cost.sure:
+            text = f"{text} (noise)"
+        rows.append(
+            (cost.parameter, text, _level_text(cost, cost.best), _level_text(cost, cost.worst))
+        )
+    return MeasureCosts(_figure(first.cost, first), of, rows, figure)
+
+
+def _level_text(cost: Cost, place: int) -> str:
+    """A bin's level, and where it is."""
+    where = cost.places[place]
+    if not isinstance(where, str):
+        where = f"{where:.3g}"
+    return f"{_figure(float(cost.level[place]), cost)} at {where}"
 
 
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
@@ -480,11 +511,12 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         )
     write_csv(table.with_name("sensitivity.csv"), names, rows)
     findings = []
-    charts = {}
+    measure_costs = {}
     for measure in dict.fromkeys(cost.measure for cost in varied_costs):
         of_it = [cost for cost in varied_costs if cost.measure == measure]
         if max(float(cost.level.max()) for cost in of_it) > 0:
-            figure = charts[WORDS[measure]] = cost_chart(of_it)
+            figure = cost_chart(of_it)
+            measure_costs[WORDS[measure]] = page_costs(of_it, figure)
             write_whole(table.with_name(f"sensitivity_{measure}.png"), png(figure))
             findings.append(finding(of_it))
     summary = {
@@ -496,7 +528,7 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         **budget,
         "findings": findings,
     }
-    write_campaign_page(table.with_name(PAGE_FILE), summary, budget_table, charts)
+    write_campaign_page(table.with_name(PAGE_FILE), summary, budget_table, measure_costs)
     return summary
 
 

@@ -12,13 +12,14 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.reading import MAX_TOML_BYTES, read_text
 from hilstar.instruments.campaign.backlog import MAX_DEATHS, Backlog, Task
-from hilstar.instruments.campaign.cases import CaseMaker, bench_columns, columns, failed, first_row
+from hilstar.instruments.campaign.cases import CaseMaker, bench_columns, failed, first_row
 from hilstar.instruments.campaign.job import Identity, Job, files_sha256, identity_of
 from hilstar.instruments.campaign.plan import (
     BENCH_KEYS,
     MAX_BENCH_CASES,
     Design,
     Plan,
+    Require,
     checked_conditions,
     grid_levels,
     parse_plan,
@@ -43,13 +44,23 @@ if TYPE_CHECKING:
 class Campaign:
     """A campaign that is checked and ready to run; nothing is written yet. Raises InputError or
     MachineError.
+
+    `text` is the plan's, in the place of that of the file `path`.
     """
 
     def __init__(
-        self, path: Path, directory: Path, solver: str, timeout_s: float, images: bool
+        self,
+        path: Path,
+        directory: Path,
+        solver: str,
+        timeout_s: float,
+        images: bool,
+        *,
+        text: str | None = None,
     ) -> None:
         require_parquet()
-        text = read_text(path, "give the path of a plan", MAX_TOML_BYTES)
+        if text is None:
+            text = read_text(path, "give the path of a plan", MAX_TOML_BYTES)
         self.path = path
         self.directory = directory
         self.plan: Plan = parse_plan(path, text)
@@ -76,7 +87,7 @@ class Campaign:
                     identity_of("the bench"),
                     CaseMaker(self.plan, self.file, path.parent),
                 )
-                self.columns = bench_columns(self.maker.parameters)
+                self.columns = bench_columns(self.maker.parameters, self.plan.columns)
             else:
                 session = Session(self.job)
                 try:
@@ -84,7 +95,7 @@ class Campaign:
                     self.maker = session.maker
                 finally:
                     session.close()
-                self.columns = columns(self.maker.parameters, "stars" in session.columns)
+                self.columns = session.columns
         except InputError as error:
             raise InputError(
                 f"{path}: {error}" if "[[vary]]" in str(error) else str(error)
@@ -94,8 +105,7 @@ class Campaign:
                 f'{path}: through = "bench" needs the tracker\'s answers; write [answers] with'
                 f' source = "serial" or the like in {self.file.path}'
             )
-        for require in self.plan.require:
-            checked_conditions(require.condition, self.columns)
+        self.check_conditions(self.plan.require)
         levels = grid_levels(self.plan)
         self.cases = self.plan.cases or math.prod(levels)
         if self.on_bench and self.cases > MAX_BENCH_CASES:
@@ -106,12 +116,21 @@ class Campaign:
             self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels
         )
 
+    def check_conditions(self, requires: list[Require]) -> None:
+        """Refuse (InputError) conditions on columns that its table will not have."""
+        for require in requires:
+            checked_conditions(require.condition, self.columns)
+
     def about(self) -> About:
         """Everything that the rows depend on."""
         plan = msgspec.json.decode(msgspec.json.encode(self.plan, enc_hook=str))
         for key in () if self.on_bench else BENCH_KEYS:
             del plan[key]
         del plan["require"]  # judged afterwards: another limit is no other campaign
+        # so that a campaign of before they were keys is still the same
+        for key in ("columns", "planted"):
+            if not plan[key]:
+                del plan[key]
         identity = msgspec.to_builtins(self.identity)
         return About(
             plan,

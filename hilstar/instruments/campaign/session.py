@@ -18,7 +18,6 @@ from hilstar.basics.files import make_directory
 from hilstar.instruments.campaign.cases import (
     Case,
     CaseMaker,
-    CaseTally,
     Kind,
     columns,
     failed,
@@ -34,8 +33,10 @@ from hilstar.instruments.campaign.job import (
     peak_bytes,
 )
 from hilstar.instruments.campaign.plan import Plan, parse_plan
+from hilstar.instruments.campaign.planted import CaseConditions, CaseTracker
 from hilstar.instruments.campaign.solvers import CENTROIDS, SolverFault, choose_solver
 from hilstar.instruments.campaign.store import Row
+from hilstar.instruments.campaign.tally import CaseTally
 from hilstar.instruments.simulate.pictures import write_exposure_fits
 from hilstar.instruments.simulate.simulator import FrameNoise, Simulator
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
@@ -70,7 +71,9 @@ class Session:
                 " differs there; copy it"
             )
         self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
-        self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
+        self.columns: dict[str, Kind] = columns(
+            self.maker.parameters, job.solver == CENTROIDS, self.plan.columns
+        )
         self._solver = choose_solver(
             job.solver,
             self.plan.centroids,
@@ -117,8 +120,20 @@ class Session:
         exposure_s = tracker.config.tracker.exposure_s
         length_s = (self.plan.frames - 1) * self.plan.step_s + exposure_s
         fault_end_s = self.maker.fault_end_s(case, length_s)
-        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec, fault_end_s)
+        acceleration_rad_s2 = case.acceleration_rad_s2
+        tally = CaseTally(
+            "stars" in self.columns,
+            self.plan.wrong_above_arcsec,
+            fault_end_s,
+            further=self.plan.columns,
+            acceleration_rad_s2=acceleration_rad_s2,
+        )
         noise = FrameNoise(self.plan.noise, case.noise_seed)
+        velocity_km_s = np.array(tracker.config.sky.observer_velocity_km_s)
+        false_stars = tracker.config.tracker.detector.false_stars
+        conditions = CaseConditions(velocity_km_s, acceleration_rad_s2, false_stars, fault_end_s)
+        told = "rate" in self.plan.columns
+        reporter = CaseTracker(self.plan.planted, case.noise_seed, conditions, told)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, exposure_s)
             # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and
@@ -140,11 +155,10 @@ class Session:
                 write_exposure_fits(path, tracker, exposure, noise)
             tally.see(exposure)
             try:
-                tally.hear(
-                    exposure,
-                    self._solver.solve(exposure, tracker),
-                    frame * self.plan.step_s + exposure_s,
-                )
+                solved = self._solver.solve(exposure, tracker)
+                begun_s = frame * self.plan.step_s
+                answer = reporter.reported(solved, exposure, begun_s + exposure_s / 2)
+                tally.hear(exposure, answer, begun_s + exposure_s)
             except SolverFault as error:
                 return failed(tally.into(row), one_line(str(error)))
         return tally.into(row)

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.server.answers.answer import ReportedStar
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +31,16 @@ class CentroidErrors:
 
 @dataclass(frozen=True, slots=True)
 class SolverAnswer:
-    """An attitude, or None and the reason; from the centroider also the centroids' errors."""
+    """An attitude, or None and the reason; from the centroider also the centroids' errors.
+
+    `rate_cam_rad_s` (3,) is the reported rate, None where there is none, `stamp_s` the reported
+    time of measurement after the middle of the exposure, `stars` the reported stars, None where the
+    tracker reports no stars.
+    """
 
     q_icrs_to_cam: FloatArray | None
     why: str = ""
     star_errors: CentroidErrors | None = None
+    rate_cam_rad_s: FloatArray | None = None
+    stamp_s: float = 0.0
+    stars: tuple[ReportedStar, ...] | None = None

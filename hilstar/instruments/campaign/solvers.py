@@ -34,6 +34,8 @@ from hilstar.instruments.simulate.pictures import write_dn_picture
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.instruments.simulate.star_finder import crowded, nearest
 from hilstar.optics.psf import GaussianPsf, Psf
+from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.answers.formats import reported_stars
 from hilstar.server.bench.cameras import flight_camera, tracker_psf
 from hilstar.server.bench.config import GAUSSIAN
 from hilstar.server.bench.config.hardware import TrackerOptics
@@ -65,6 +67,15 @@ class SolverFault(Exception):
 
 
 SolvedTracker = Simulator | DisplayTracker | LiveTracker  # whose images are solved
+
+
+class WholeAnswer(msgspec.Struct, frozen=True):
+    """What a function may return in the place of a quaternion."""
+
+    q: tuple[float, float, float, float] | None = None
+    rate: tuple[float, float, float] | None = None
+    stamp_s: float = 0.0
+    centroids: list[list[float | None]] | None = None
 
 
 class Solver(Protocol):
@@ -154,17 +165,20 @@ class CentroidSolver:
             dy_px = places[1] - y_px
         counts = len(truth), len(stars), matched, len(stars) - matched
         errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good], truth[good])
+        inner = np.flatnonzero(~stars.at_edge)
+        reported = tuple(
+            ReportedStar(float(stars.x_px[k]), float(stars.y_px[k]), float(stars.flux[k]))
+            for k in inner
+        )
         if len(x_px) < MIN_STARS:
-            return SolverAnswer(
-                None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors
-            )
+            why = f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}"
+            return SolverAnswer(None, why, errors, stars=reported)
         true = normalise(tracker.camera.rays(x_px, y_px))
         known = flight_camera(tracker.config.tracker, tracker.file.folder, tracker.camera)
         rays = normalise(known.rays(x_px + dx_px, y_px + dy_px))
         # Weights are the stars' light, the inverse of photon noise's variance.
-        return SolverAnswer(
-            multiply(wahba(rays, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors
-        )
+        q = multiply(wahba(rays, true, flux[good]), exposure.view.q_icrs_to_cam)
+        return SolverAnswer(q, "", errors, stars=reported)
 
     def _fitted(
         self, exposure: Exposure, tracker: SolvedTracker, truth: npt.NDArray[np.void], first: Places
@@ -231,8 +245,9 @@ class FunctionSolver:
     """Calls `function(image, tracker)` with DN, uint16 (height, width), and the facts of the
     tracker's optics.
 
-    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. The module stands in
-    `folder`.
+    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none; or a dictionary of `q` and,
+    where it tells them, `rate` (rad/s, cam), `stamp_s` and `centroids` ([x_px, y_px, dn, hip]). The
+    module stands in `folder`.
     Raises InputError where there is no such function.
     """
 
@@ -257,9 +272,29 @@ class FunctionSolver:
             raise SolverFault(
                 one_line(f"the solver raised {type(error).__name__}: {error}")
             ) from error
+        if isinstance(answer, dict):
+            return whole_answer(answer, "the solver")
         if answer is None:
             return SolverAnswer(None, "the solver found no attitude")
         return SolverAnswer(checked_attitude(answer, "the solver"))
+
+
+def whole_answer(told: dict[str, Any], who: str) -> SolverAnswer:
+    """An answer of several parts. Raises SolverFault for one that is none."""
+    try:
+        answer = msgspec.convert(told, WholeAnswer, strict=False)
+    except msgspec.ValidationError as error:
+        raise SolverFault(f"{who}: {shortened(error)}; see docs/campaign.md") from error
+    stars = None
+    if answer.centroids is not None:
+        stars = reported_stars(answer.centroids)
+    rate_rad_s = None
+    if answer.rate is not None:
+        rate_rad_s = np.array(answer.rate)
+    if answer.q is None:
+        return SolverAnswer(None, f"{who} found no attitude", stars=stars)
+    q = checked_attitude(answer.q, who)
+    return SolverAnswer(q, rate_cam_rad_s=rate_rad_s, stamp_s=answer.stamp_s, stars=stars)
 
 
 def given_image(exposure: Exposure, tracker: SolvedTracker) -> npt.NDArray[np.uint16]:

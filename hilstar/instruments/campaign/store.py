@@ -56,6 +56,7 @@ def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> "pa.Schem
     import pyarrow as pa
 
     kinds = {"int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()}
+    kinds |= {"floats": pa.list_(pa.float64())}
     return pa.schema(
         [pa.field(name, kinds[kind]) for name, kind in columns.items()], metadata=dict(about)
     )

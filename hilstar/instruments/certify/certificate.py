@@ -26,8 +26,9 @@ from hilstar.instruments.certify.budget import (
 from hilstar.instruments.certify.check import take_check
 from hilstar.instruments.certify.model import THIRDS, true_deviations
 from hilstar.instruments.certify.readings import Reader
+from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import (
+from hilstar.server.bench.certificate_file import (
     KIND,
     ByTrials,
     Certificate,
@@ -61,8 +62,8 @@ MEASURANDS = {
     "star_flux": (
         "flux, with what the codes lose, and the errors of the catalogue and of the spectrum, mag"
     ),
-    "star_place_along": "place_along, with the catalogue's error, arcsec",
-    "star_place_across": "place_across, with the catalogue's error, arcsec",
+    "star_place_along": "the same as along x, with the catalogue's error, arcsec",
+    "star_place_across": "the same as along y, with the catalogue's error, arcsec",
 }
 UNKNOWN = {
     "latency": ("latency",),
@@ -164,6 +165,7 @@ def certify(
         reference_sha256=None if reference is None else sha256_of(reference),
         replaces=replaces,
     )
+    certificate = msgspec.structs.replace(certificate, cube=cube_to_boresight(file, certificate))
     return certificate, reference
 
 

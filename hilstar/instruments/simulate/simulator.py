@@ -191,7 +191,9 @@ class Simulator(Closing):
             self._load_tracker()
         self._layers = sky_layers(self.canvas, self.sources)
         target = Target(self.config.tracker.resolution_px, self.canvas.psf)
-        if target != self.renderer.target:
+        drawn = self.renderer.target
+        # not the targets: a comparison of their arrays is no truth value
+        if (target.resolution_px, target.psf) != (drawn.resolution_px, drawn.psf):
             self.renderer.close()
             self.renderer = open_backend(target, headless_context(self.config.render.gpu))
 
@@ -235,6 +237,7 @@ class Simulator(Closing):
         canvas = self.canvas
         view = rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
+        # without a generator there is no noise, and stars do not twinkle
         if self.moving is not None and self.moving.air is not None and rng is not None:
             stars = self.moving.air.twinkling(stars, self.moving.utc_ns(view.t_ns), exposure_s, rng)
         layers = self._layers

@@ -111,7 +111,7 @@ def answer_of(
         mode,
         stars,
         said.rms_arcsec,
-        _reported(said.centroids),
+        reported_stars(said.centroids),
     )
     if said.q is None or not said.valid:  # without an attitude its numbers may be anything
         if said.q is None:
@@ -124,7 +124,7 @@ def answer_of(
     return replace(plain, q_icrs_to_cam=camera.q_icrs_to_cam, rate_cam_rad_s=camera.rate_cam_rad_s)
 
 
-def _reported(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
+def reported_stars(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
     """The stars of rows [x_px, y_px, dn, hip]; rows that are none of that are left out."""
     stars = []
     for row in rows:

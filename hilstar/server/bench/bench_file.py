@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 
 MAX_NAMED_BYTES = 100_000_000
 MIN_HEADS, MAX_HEADS = 2, 8
+CHANGE_NO_FRAME = ("certify", "alignment")  # tables of what is said of a bench
 EXAMPLE = 'write heads = ["a.toml", "b.toml"], a bench file for each'
 
 
@@ -158,8 +159,9 @@ def stated_in(config: BenchConfig) -> "Stated":
 
 
 def _sha256(config: BenchConfig, folder: Path) -> str:
-    # changes no frame
-    kept = {name: value for name, value in msgspec.to_builtins(config).items() if name != "certify"}
+    kept = msgspec.to_builtins(config)
+    for table in CHANGE_NO_FRAME:
+        del kept[table]
     kept["render"] |= _hashed_tolerance(config.render)
     del kept["tracker"]["camera"]  # how images are taken; it changes no frame either
     del kept["tracker"]["sensor"]  # its figures stand under their own keys

@@ -136,7 +136,7 @@ def test_images_that_are_taken_here_give_what_their_files_give(session, tmp_path
         (("frame_001.png", "--grab", "genicam:"), "--grab takes the images"),
         (("frame_001.png", "--exposure", "1"), "--exposure: is for --grab"),
         (("--grab", "cp {pattern} {output}", "--exposure", "1"), "--grab has no {exposure_s}"),
-        (("--grab", "cp {pattern} {output}", "--frames", "3"), "write an endpoint"),
+        (("--grab", "cp {pattern} {output}", "--feed", "3"), "not an endpoint"),
         (("--grab", "false {pattern} {output}"), "ended with code 1"),
     ],
 )

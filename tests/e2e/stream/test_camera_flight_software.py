@@ -79,7 +79,7 @@ def test_flight_software_before_the_camera_is_assessed(tmp_path):
     flight = FlightSoftware(bench)
     ledger, address = tmp_path / "run.mcap", own_address()
     replay = [*HILSTAR, "replay", bench, log(tmp_path / "log.csv", 120.0), "--headless"]
-    replay += ["--frames", endpoint, "--ledger", ledger]
+    replay += ["--feed", endpoint, "--ledger", ledger]
     watcher = [*HILSTAR, "tracker", bench, "--watch", endpoint, "--camera", address, "--json"]
     quiet = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with (
@@ -189,7 +189,7 @@ def test_the_trackers_images_are_those_of_its_simulator_with_its_seed(tmp_path):
     watcher = [*HILSTAR, "tracker", bench, "--watch", endpoint, "--camera", address]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with (
-        Started([*map(str, replay), "--frames", endpoint], **quiet) as display,
+        Started([*map(str, replay), "--feed", endpoint], **quiet) as display,
         Started([*map(str, watcher), "--seed", "5"], **quiet) as tracker,
         FrameWatch(endpoint) as watch,
         GigEClient(address) as client,

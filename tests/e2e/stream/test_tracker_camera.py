@@ -58,7 +58,7 @@ def display(tmp_path_factory):
     (folder / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{q}\n600,{q}\n")
     command = [*HILSTAR, "replay", folder / "bench.toml", folder / "log.csv", "--headless"]
     with Started(
-        [*map(str, command), "--frames", endpoint],
+        [*map(str, command), "--feed", endpoint],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     ) as process:

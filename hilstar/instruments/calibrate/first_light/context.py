@@ -31,8 +31,8 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
     VirtualBench,
     black,
 )
-from hilstar.instruments.calibrate.geometric.calibration import psf_sigma_of
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen
+from hilstar.instruments.calibrate.geometric.geometry_fit import psf_sigma_of
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file, with_key

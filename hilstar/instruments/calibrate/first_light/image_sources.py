@@ -195,7 +195,7 @@ class ImageSource:
 
     def hand_on(self, frames: "PatternFrames") -> None:
         """Hand the patterns to watchers, too. Raises InputError without a display."""
-        raise InputError("--frames: this session shows nothing here; leave --frames out")
+        raise InputError("--feed: this session shows nothing here; leave --feed out")
 
     def close(self) -> None:
         """Free the display."""

@@ -17,6 +17,7 @@ from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.basics.toml_tables import Kind, Table, explained
 from hilstar.basics.units import LIGHT_KM_S, MAX_SPEED_KM_S, NS_PER_S
 from hilstar.server.bench.config import hardware
+from hilstar.server.bench.config.alignment import AlignmentSettings, check_alignment
 from hilstar.server.bench.config.answers import AnswersSettings, check_answers
 from hilstar.server.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
 from hilstar.server.bench.config.certify import CertifySettings
@@ -67,6 +68,7 @@ class BenchConfig(Table, frozen=True):
     sync: hardware.SyncSettings = msgspec.field(default_factory=hardware.SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
     certify: CertifySettings = msgspec.field(default_factory=CertifySettings)
+    alignment: AlignmentSettings | None = None
     answers: AnswersSettings | None = None
     site: SiteSettings | None = None
 
@@ -237,11 +239,10 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
             render = msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG)
         if render.colour == "depth":
             render = msgspec.structs.replace(render, bit_stealing=True)
-        if (
-            sky.epoch_utc not in {FROM_SOURCE, UNIX}
-            and (utc_ns := epoch_utc_ns(config)) is not None
-        ):
-            sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
+        if sky.epoch_utc not in {FROM_SOURCE, UNIX}:
+            utc_ns = epoch_utc_ns(config)
+            if utc_ns is not None:
+                sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
         return msgspec.structs.replace(config, render=render, sky=sky)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -308,6 +309,8 @@ def _check_meaning(config: BenchConfig) -> None:
     hardware.check_channels(config.tracker)
     hardware.check_primaries(config.monitor.primaries)
     _check_colour(config)
+    if config.alignment is not None:
+        check_alignment(config.alignment)
     hardware.check_sync(config.sync, config.tracker, config.monitor, config.attitude)
     try:
         check_road(config.attitude)

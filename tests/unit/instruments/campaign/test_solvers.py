@@ -14,9 +14,9 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.instruments.campaign.cases import attitude_error_arcsec
 from hilstar.instruments.campaign.plan import Centroiding
 from hilstar.instruments.campaign.solvers import SolverFault, choose_solver, printed_attitude
+from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import ROOT

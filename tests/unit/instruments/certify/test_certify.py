@@ -450,6 +450,8 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     assert "<strong>Does not conform: " in page
     assert "star&#x27;s place along x" in page and "<td>place_along</td>" not in page
     assert ">-</td>" not in page and ">unlimited</td>" not in page
+    assert "place_along" not in page and "psf_sigma" not in page and "{}" not in page
+    assert "collimator: quaternion cam to mon</th><td>1, 0, 0, 0</td>" in page
     assert run_hilstar_here(*words).returncode == 2
     assert run_hilstar_here(*words, "--check").returncode == 0
     plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6))
@@ -461,13 +463,23 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     assert "drift" in {each["name"] for each in again["inputs"]}  # by the checks between
 
 
+CUBE = """
+[alignment]
+q_mon_to_reference = [1.0, 0.0, 0.0, 0.0]
+covariance_arcsec2 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 4.0]]
+name = "cube 7"
+"""
+
+
 @pytest.mark.usefixtures("without_charts")
 def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
     bench, truth = plant(
-        tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION
+        tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION + CUBE
     )
     words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")
     number = msgspec.json.decode(run_hilstar_here(*words).stdout)["number"]
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "Cube to tracker&#x27;s boresight" in page and "of cube 7, within" in page
     bench.write_text(
         bench.read_text().replace("fields = 1", 'fields = 1\ncertificate = "out/certificate.json"')
     )
@@ -492,7 +504,7 @@ def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run:
     ledger, telemetry = write_run(
         tmp_path,
         planted_run,
-        bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}}),
+        bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}}) + CUBE,
     )
     words = (
         "assess",
@@ -504,7 +516,11 @@ def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run:
         "--display-attitudes",
         "0",
     )
-    part = msgspec.json.decode(run_hilstar_here(*words).stdout)["bench"]
+    told = msgspec.json.decode(run_hilstar_here(*words).stdout)
+    assert told["cube_to_boresight"]["reference"] == "cube 7"
+    # what the certificate does not know, the cube's direction cannot be known to
+    assert told["cube_to_boresight"]["cross_arcsec"] > told["bench"]["off_arcsec"]["cross"]
+    part = told["bench"]
     assert part["certificate"] == number
     assert 0 < part["share_of_bias"]["cross"] <= 1
     assert "could have made" in (tmp_path / "assessed" / "budget.html").read_text()

@@ -15,8 +15,8 @@ from PIL import Image
 from hilstar.basics.fits_headers import read_fits_image
 from hilstar.instruments.calibrate.first_light.image_sources import GrabCamera
 from hilstar.instruments.confront import page
-from hilstar.instruments.confront.files import read_tracker_file
 from hilstar.instruments.confront.images import read_photographs
+from hilstar.instruments.confront.measured_bench import read_tracker_file
 from hilstar.server.genicam.camera import has_aravis
 from hilstar.server.gige.registers import CameraSettings
 from tests.support.commands import run_hilstar_here

@@ -12,11 +12,11 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.campaign.cases import attitude_error_arcsec
 from hilstar.instruments.campaign.plan import Centroiding, parse_plan
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.solvers import CENTROIDS, choose_solver
+from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.glass import told_psf
 from hilstar.instruments.simulate.optics import TwinOptics

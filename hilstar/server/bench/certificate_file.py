@@ -77,6 +77,37 @@ class InputRow(msgspec.Struct, frozen=True, kw_only=True):
     source: str
 
 
+class CubeToBoresight(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the tracker's boresight points in the reference's axes, and how sure that is.
+
+    `boresight` is a unit vector; `q_tracker_to_reference` turns the tracker's components into the
+    reference's. `cross_arcsec` is the radius about the boresight that holds it at 95 %, and
+    `roll_arcsec` the half width about it; None where a part is not known, which `without` names.
+    """
+
+    reference: str
+    boresight: tuple[float, float, float]
+    q_tracker_to_reference: tuple[float, float, float, float]
+    cross_arcsec: float | None
+    roll_arcsec: float | None
+    without: tuple[str, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """The same in a sentence."""
+        x, y, z = self.boresight
+        where = f"x {x:+.7f}, y {y:+.7f}, z {z:+.7f} of {self.reference or 'the reference'}"
+        if self.cross_arcsec is None or self.roll_arcsec is None:
+            size = "its uncertainty is not known"
+        else:
+            size = (
+                f"within {self.cross_arcsec:.3g} arcsec across and {self.roll_arcsec:.3g} about it"
+                " (95 %)"
+            )
+        missing = f"; without {', '.join(self.without)}" if self.without else ""
+        return f"{where}, {size}{missing}"
+
+
 class Certificate(msgspec.Struct, frozen=True, kw_only=True):
     """A whole certificate. Times are UTC; `files` has the SHA-256 of the bench file and of each
     file that it names.
@@ -108,6 +139,7 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
     measurands: dict[str, str]
     reference_sha256: str | None = None
     replaces: str | None = None
+    cube: CubeToBoresight | None = None
 
     def expanded(self, quantities: Iterable[str]) -> float | None:
         """The largest |value| + half width of the interval of some quantities; None where it has

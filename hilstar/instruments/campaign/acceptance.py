@@ -1,0 +1,304 @@
+"""An acceptance: the campaigns of a plan's sets of cases, one after the other, and the verdict of
+each clause.
+
+Each set has a directory of its own below that of the acceptance, each level of a sweep one below
+that: campaigns that go on where they were. So the same command goes on where an acceptance was, and
+a plan with other limits judges it again.
+"""
+
+import functools
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hilstar.basics.charts import write_csv
+from hilstar.basics.files import write_whole
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
+from hilstar.instruments.campaign.figures import TooFewCases
+from hilstar.instruments.campaign.requirements import (
+    NOT_SHOWN,
+    RequirementVerdict,
+    judged_figure,
+    verdicts_of,
+)
+from hilstar.instruments.campaign.results import Columns, read_cases
+from hilstar.instruments.campaign.run import Campaign
+from hilstar.instruments.campaign.session import Session
+from hilstar.instruments.campaign.store import Directory, failures
+from hilstar.instruments.campaign.sweep import LevelCount, counted, edge_figure, next_level
+from hilstar.server.bench.alignment import cube_to_boresight
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.certificate_file import Certificate, CubeToBoresight, bench_certificate
+
+NOT_TESTED = "not tested"
+PLAN_FILE, LEDGER = "plan.toml", "ledger.csv"
+TIMED_CASES = 2  # of a set, whose time tells that of all
+LEDGER_COLUMNS = (
+    *("case", "status", "why", "noise_seed", "ra_deg", "dec_deg", "roll_deg"),
+    *("frames", "solved", "wrong", "first_attitude_s"),
+    *("error_x_arcsec", "error_y_arcsec", "error_z_arcsec"),
+)
+RunCases = Callable[[Campaign, Directory, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ClauseVerdict:
+    """A clause with its verdict; `untested` says why it has none, "" where it has."""
+
+    clause: ClauseTable
+    verdict: RequirementVerdict | None
+    unit: str
+    untested: str = ""
+
+    @property
+    def word(self) -> str:
+        """The verdict in a word or two."""
+        return NOT_TESTED if self.verdict is None else self.verdict.verdict
+
+
+@dataclass(slots=True)
+class SetResult:
+    """What a set of cases gave: the cases of its table, or the levels of its sweep; where each
+    campaign is, and how many cases failed by reason.
+    """
+
+    case_set: CaseSet
+    cases: Columns | None = None
+    levels: list[LevelCount] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+    failed: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class CostOfSet:
+    """How many cases a set has at most, and how long they take, s."""
+
+    case_set: CaseSet
+    cases: int
+    seconds: float
+
+
+class Acceptance:
+    """The acceptance of a plan in a directory. Raises InputError and MachineError."""
+
+    def __init__(
+        self, plan: AcceptancePlan, bench: Path, directory: Path, solver: str, timeout_s: float
+    ) -> None:
+        self.plan = plan
+        self.directory = directory
+        self.file: BenchFile = read_bench_file(bench)
+        self._solver = solver
+        self._timeout_s = timeout_s
+        self.on_bench = plan.through == "bench"
+        self.certificate: Certificate | None = None
+        if self.on_bench:
+            self.certificate = bench_certificate(self.file)
+
+    def campaign(self, case_set: CaseSet, folder: Path, level: float | None = None) -> Campaign:
+        """The campaign of a set of cases, at a level of its sweep."""
+        text = case_set.text(level)
+        path = self.plan.path
+        return Campaign(path, folder, self._solver, self._timeout_s, False, text=text)
+
+    def check(self) -> None:
+        """Refuse (InputError) sets whose campaigns could not run, before the first case."""
+        for case_set in self.plan.sets:
+            if not case_set.refused:
+                folder = self.directory / case_set.name
+                start = case_set.sweep.start if case_set.sweep is not None else None
+                campaign = self.campaign(case_set, folder, start)
+                requires = [clause.require for clause in self.plan.clauses_of(case_set.name)]
+                campaign.check_conditions(requires)
+
+    def costs(self, workers: int) -> Iterator[CostOfSet]:
+        """How long each set takes, by the time of its first cases; on a bench, by its timeout at
+        most.
+        """
+        for case_set in self.plan.sets:
+            if case_set.refused:
+                continue
+            sweep = case_set.sweep
+            start = None if sweep is None else sweep.start
+            campaign = self.campaign(case_set, self.directory / case_set.name, start)
+            cases = campaign.cases * (1 if sweep is None else sweep.levels)
+            if self.on_bench:
+                yield CostOfSet(case_set, cases, cases * campaign.plan.limit_s)
+                continue
+            yield CostOfSet(case_set, cases, cases * _case_s(campaign) / min(workers, cases))
+
+    def run(self, run_cases: RunCases) -> list[SetResult]:
+        """Run what is missing of each set, in the plan's order."""
+        write_whole(self.directory / PLAN_FILE, self.plan.text)
+        results = []
+        for case_set in self.plan.sets:
+            result = SetResult(case_set)
+            folder = self.directory / case_set.name
+            if not case_set.refused and case_set.sweep is None:
+                result.cases = self._table(result, folder, None, run_cases)
+            elif case_set.sweep is not None and not case_set.refused:
+                self._run_sweep(result, folder, run_cases)
+            results.append(result)
+        return results
+
+    def _run_sweep(self, result: SetResult, folder: Path, run_cases: RunCases) -> None:
+        sweep = result.case_set.sweep
+        assert sweep is not None
+        while (level := next_level(sweep, result.levels)) is not None:
+            of_level = folder / f"level-{len(result.levels):02d}"
+            cases = self._table(result, of_level, level, run_cases)
+            result.levels.append(counted(level, cases))
+
+    def _table(
+        self, result: SetResult, folder: Path, level: float | None, run_cases: RunCases
+    ) -> Columns:
+        """The cases of a campaign, run where its table is not there yet."""
+        case_set = result.case_set
+        campaign = self.campaign(case_set, folder, level)
+        directory = Directory(folder)
+        try:
+            directory.claim(campaign.about())
+            if not directory.table.exists():
+                at = "" if level is None else f" at {level:.4g}"
+                run_cases(campaign, directory, f"{case_set.name}{at}")
+        finally:
+            directory.close()
+        result.folders.append(folder)
+        for why, count in failures(directory.table).items():
+            result.failed[why] = result.failed.get(why, 0) + count
+        return read_cases(directory.table)
+
+    def verdicts(self, results: list[SetResult]) -> list[ClauseVerdict]:
+        """The verdict of each clause, in the plan's order."""
+        by_name = {result.case_set.name: result for result in results}
+        judged: dict[int, ClauseVerdict] = {}
+        for name, result in by_name.items():
+            clauses = self.plan.clauses_of(name)
+            for clause, verdict in zip(clauses, self._judged(clauses, result), strict=True):
+                judged[id(clause)] = verdict
+        return [judged[id(clause)] for clause in self.plan.clauses]
+
+    def _judged(self, clauses: list[ClauseTable], result: SetResult) -> list[ClauseVerdict]:
+        units = [_unit(clause, result.case_set) for clause in clauses]
+        refused = result.case_set.refused
+        if refused:
+            return [
+                ClauseVerdict(clause, None, unit, refused)
+                for clause, unit in zip(clauses, units, strict=True)
+            ]
+        requires = [clause.require for clause in clauses]
+        if result.cases is None:
+            verdicts = [self._edge(clause, result) for clause in clauses]
+        else:
+            arcsec, seconds = self.own_error
+            seed = self.plan.seed
+            verdicts = verdicts_of(requires, result.cases, self.scale, seed, arcsec, seconds)
+        return [
+            self._told(clause, verdict, unit)
+            for clause, verdict, unit in zip(clauses, verdicts, units, strict=True)
+        ]
+
+    def _told(self, clause: ClauseTable, verdict: RequirementVerdict, unit: str) -> ClauseVerdict:
+        """A verdict, or why there is none: what cases alone cannot show is not tested."""
+        why = ""
+        if clause.quantity == "time-bias" and self.on_bench:
+            why = self._no_time()
+        elif verdict.verdict == NOT_SHOWN and verdict.value is None and verdict.more is None:
+            why = verdict.method
+        if why:
+            return ClauseVerdict(clause, None, unit, why)
+        return ClauseVerdict(clause, verdict, unit)
+
+    def _no_time(self) -> str:
+        """Why a tracker's stamps tell no time of measurement; "" where they do."""
+        answers = self.file.config.answers
+        if answers is None or answers.clock == "own" or answers.stamp == "arrival":
+            return (
+                "the stamps are of the tracker's own clock, whose offset hides their bias; where it"
+                ' is synchronised, write [answers] clock = "unix" or "host"'
+            )
+        return ""
+
+    def _edge(self, clause: ClauseTable, result: SetResult) -> RequirementVerdict:
+        sweep = result.case_set.sweep
+        assert sweep is not None
+        try:
+            figure = edge_figure(sweep, result.levels, clause.confidence)
+        except TooFewCases as few:
+            return RequirementVerdict(clause.require, 0, None, None, NOT_SHOWN, None, str(few))
+        return judged_figure(clause.require, figure)
+
+    @property
+    def scale(self) -> Scale:
+        """The scale of the tracker's image."""
+        tracker = self.file.config.tracker
+        focal_px = tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um
+        return Scale(focal_px, tracker.resolution_px)
+
+    @property
+    def own_error(self) -> tuple[tuple[float, float] | None, float]:
+        """How far the bench's own attitude may be off at 95 %, arcsec across and about, and its
+        own time, s; None and 0 where no certificate says it.
+        """
+        if self.certificate is None:
+            return None, 0.0
+        late_ms = self.certificate.expanded(("latency",)) or 0.0
+        return self.certificate.attitude_arcsec, late_ms / 1e3
+
+    @functools.cached_property
+    def cube(self) -> CubeToBoresight | None:
+        """From the reference to the tracker's boresight; None without [alignment]."""
+        return cube_to_boresight(self.file, self.certificate)
+
+
+def _unit(clause: ClauseTable, case_set: CaseSet) -> str:
+    if clause.quantity == "edge" and case_set.sweep is not None:
+        return case_set.sweep.unit
+    return clause.require.unit
+
+
+def _case_s(campaign: Campaign) -> float:
+    """The time of a case, s: the mean of the first TIMED_CASES, after one that warms up."""
+    count = min(TIMED_CASES, campaign.cases)
+    points = campaign.design.points(0, count)
+    session = Session(campaign.job)
+    try:
+        session.row(0, points[0])
+        begun_s = time.perf_counter()
+        for number, point in enumerate(points):
+            session.row(number, point)
+        return (time.perf_counter() - begun_s) / count
+    finally:
+        session.close()
+
+
+def write_ledger(path: Path, results: list[SetResult]) -> int:
+    """Write a row for each case of each set; how many there are."""
+    rows: list[tuple[Any, ...]] = []
+    for result in results:
+        for folder in result.folders:
+            cases = read_cases(folder / "cases.parquet")
+            level = _level_of(cases, result)
+            columns = [_cells(cases, name) for name in LEDGER_COLUMNS]
+            for row in zip(*columns, strict=True):
+                rows.append((result.case_set.name, level, *row))
+    write_csv(path, ("set", "level", *LEDGER_COLUMNS), rows)
+    return len(rows)
+
+
+def _level_of(cases: Columns, result: SetResult) -> float | None:
+    if result.case_set.sweep is None:
+        return None
+    return float(cases.numbers[f"vary.{result.case_set.sweep.key}"][0])
+
+
+def _cells(cases: Columns, name: str) -> list[Any]:
+    if name in cases.texts:
+        return list(cases.texts[name])
+    values = cases.numbers.get(name)
+    if values is None:
+        return [""] * len(cases.numbers["case"])
+    return ["" if math.isnan(value) else f"{value:.9g}" for value in values.tolist()]

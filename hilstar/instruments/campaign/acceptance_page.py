@@ -1,0 +1,361 @@
+"""The page of an acceptance, accept.html: each capability with its requirement, figure and verdict,
+what was not tested and why, and the ledger; the same as acceptance.csv and JSON.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from hilstar.basics.charts import BLUE, MUTED, panels_of, write_csv
+from hilstar.basics.files import write_whole
+from hilstar.basics.pages import (
+    BAD,
+    DASH,
+    OK,
+    WARN,
+    Card,
+    KeyFigure,
+    Markup,
+    Verdict,
+    drawing_of,
+    figures_of,
+    page_of,
+    paragraph,
+    table_of,
+    within,
+)
+from hilstar.basics.version import __version__
+from hilstar.instruments.campaign.acceptance import (
+    LEDGER,
+    NOT_TESTED,
+    Acceptance,
+    ClauseVerdict,
+    SetResult,
+)
+from hilstar.instruments.campaign.figures import clopper_pearson, quantile_limits
+from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
+from hilstar.instruments.campaign.requirements_page import SIGN, SIGN_STYLE, STATES
+from hilstar.instruments.campaign.store import file_sha256
+from hilstar.instruments.campaign.sweep import levels_text
+from hilstar.server.bench.certificate_file import off_by
+
+PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
+HEADER = (
+    *("capability", "requirement", "measured (interval)", "guard band", "margin", "verdict"),
+    *("cases", "to show it", "method"),
+)
+CSV_COLUMNS = (
+    *("capability", "of", "quantity", "axis", "condition", "limit", "side", "unit", "confidence"),
+    *("value", "low", "high", "guard", "margin", "cases", "verdict", "more_cases", "why", "method"),
+)
+HEADLINES = {
+    MET: "Every clause that was tested is met",
+    NOT_MET: "A clause is not met",
+    NOT_SHOWN: "No clause is broken, and some are not shown",
+}
+CURES = {
+    NOT_MET: "Look at the ledger for the cases at fault, and change the tracker or the limit.",
+    NOT_SHOWN: "Run more cases: the table says how many would show it.",
+}
+METHOD = (
+    "Each end of an interval is a one-sided limit at the clause's confidence. Met: the whole"
+    " interval keeps the limit, narrowed by the guard band, the bench's own uncertainty (95 %). Not"
+    " met: the whole interval breaks the limit, widened by it. Not shown: neither. Margin: from the"
+    " interval to the narrowed limit, negative beyond it."
+)
+FAILED_HEADER = ("set of cases", "failed", "why")
+FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
+QUANTILES = (0.5, 0.9, 0.95, 0.99)
+MAX_ROWS = 5000  # of points in a chart
+
+
+def write_acceptance(
+    acceptance: Acceptance, results: list[SetResult], verdicts: list[ClauseVerdict], rows: int
+) -> dict[str, Any]:
+    """Write accept.html, acceptance.csv and acceptance.json; the JSON object. `rows` are those of
+    the ledger. Raises InputError.
+    """
+    folder = acceptance.directory
+    summary = summary_of(acceptance, verdicts, rows)
+    write_csv(
+        folder / CSV_FILE,
+        CSV_COLUMNS,
+        [[_plain(clause[name]) for name in CSV_COLUMNS] for clause in summary["clauses"]],
+    )
+    import msgspec
+
+    write_whole(folder / JSON_FILE, msgspec.json.format(msgspec.json.encode(summary), indent=1))
+    parts = [figures_of(_counts(verdicts))]
+    parts += [card.html() for card in _cards(acceptance, results, verdicts, rows)]
+    title = f"{acceptance.plan.title}: {acceptance.file.path.name}"
+    write_whole(folder / PAGE_FILE, page_of(title, _verdict(verdicts), parts))
+    return summary
+
+
+def verdict_of(verdicts: list[ClauseVerdict]) -> str:
+    """The verdict of all tested clauses together: the worst."""
+    words = {verdict.word for verdict in verdicts}
+    if NOT_MET in words:
+        return NOT_MET
+    if NOT_SHOWN in words or MET not in words:
+        return NOT_SHOWN
+    return MET
+
+
+def summary_of(acceptance: Acceptance, verdicts: list[ClauseVerdict], rows: int) -> dict[str, Any]:
+    """The JSON object of `hilstar accept`."""
+    arcsec, seconds = acceptance.own_error
+    own = None if arcsec is None else {"cross": arcsec[0], "roll": arcsec[1]}
+    return {
+        "title": acceptance.plan.title,
+        "plan": str(acceptance.plan.path),
+        "bench": str(acceptance.file.path),
+        "bench_sha256": acceptance.file.sha256,
+        "through": acceptance.plan.through,
+        "hilstar": __version__,
+        "verdict": verdict_of(verdicts),
+        "cases": rows,
+        "bench_off_arcsec": own,
+        "bench_off_s": seconds,
+        "cube_to_boresight": acceptance.cube,
+        "clauses": [_clause(verdict) for verdict in verdicts],
+        "untested": [
+            {"capability": each.capability, "why": each.why} for each in acceptance.plan.untested
+        ],
+    }
+
+
+def _clause(each: ClauseVerdict) -> dict[str, Any]:
+    clause, verdict = each.clause, each.verdict
+    row: dict[str, Any] = {
+        "capability": clause.capability,
+        "of": clause.of,
+        "quantity": clause.quantity,
+        "axis": (clause.axis or "cross") if clause.of_axis else "",
+        "condition": clause.condition,
+        "limit": clause.limit,
+        "side": "maximum" if clause.minimum is None else "minimum",
+        "unit": each.unit,
+        "confidence": clause.confidence,
+        "verdict": each.word,
+        "why": each.untested,
+    }
+    names = ("value", "low", "high", "guard", "margin", "cases", "method")
+    row |= {name: getattr(verdict, name) if verdict is not None else None for name in names}
+    row["more_cases"] = None if verdict is None else verdict.more
+    return row
+
+
+def _plain(value: object) -> object:
+    if value is None:
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else value
+
+
+def lines_of(
+    acceptance: Acceptance, results: list[SetResult], verdicts: list[ClauseVerdict]
+) -> list[str]:
+    """A line for each clause on the terminal, for what no clause tests, and for failed cases."""
+    width = max(len(each.clause.capability) for each in verdicts)
+    lines = []
+    for each in verdicts:
+        head = f"{each.clause.capability:{width}}  {each.word:10}"
+        if each.verdict is None:
+            lines.append(f"{head}  {each.untested}")
+        else:
+            more = f"; {_more(each)}" if _more(each) else ""
+            lines.append(f"{head}  {_requirement(each)}: {_measured(each)}{more}")
+    lines += [
+        f"{each.capability:{width}}  {NOT_TESTED}  {each.why}" for each in acceptance.plan.untested
+    ]
+    for result in results:
+        for name, count, why in _failed_rows(result):
+            lines.append(f"{name}: {count} cases failed: {why}")
+    return lines
+
+
+def _more(each: ClauseVerdict) -> str:
+    """What would show a clause that is not shown; "" for another."""
+    if each.word != NOT_SHOWN or each.verdict is None:
+        return ""
+    if each.verdict.more:
+        return f"about {each.verdict.more} more cases would show it"
+    return each.verdict.method if each.verdict.value is None else ""
+
+
+def _requirement(each: ClauseVerdict) -> str:
+    words = each.clause.require.words
+    if each.clause.quantity == "edge" and each.unit:
+        return f"{words} {each.unit}"
+    return words
+
+
+def _measured(each: ClauseVerdict) -> str:
+    verdict = each.verdict
+    if verdict is None or verdict.value is None:
+        return DASH
+    low, high = verdict.low, verdict.high
+    if low is not None and high is not None:
+        return within(verdict.value, low, high, each.unit)
+    ends = [f"{_end(low)} to {_end(high)}"]
+    return f"{verdict.value:.4g} ({ends[0]}) {each.unit}".rstrip()
+
+
+def _end(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.4g}"
+
+
+def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
+    whole = verdict_of(verdicts)
+    counts = []
+    for word in (MET, NOT_MET, NOT_SHOWN, NOT_TESTED):
+        count = sum(each.word == word for each in verdicts)
+        if count:
+            counts.append(f"{count} {word}")
+    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(verdicts)}: {', '.join(counts)}.")
+
+
+def _counts(verdicts: list[ClauseVerdict]) -> Iterator[KeyFigure]:
+    for word, state in ((MET, OK), (NOT_MET, BAD), (NOT_SHOWN, WARN), (NOT_TESTED, WARN)):
+        count = sum(each.word == word for each in verdicts)
+        if count or word == MET:
+            yield KeyFigure(str(count), word, state if count else WARN)
+
+
+def _cards(
+    acceptance: Acceptance, results: list[SetResult], verdicts: list[ClauseVerdict], rows: int
+) -> Iterator[Card]:
+    yield _clauses(verdicts)
+    yield _untested(acceptance, verdicts)
+    if failed := [row for result in results for row in _failed_rows(result)]:
+        yield Card("Failed cases", words=[table_of(failed, FAILED_HEADER)], cure=FAILED_CURE)
+    for result in results:
+        if result.levels:
+            yield _sweep_card(result)
+        elif _asked(verdicts, result, "time-to-first-attitude"):
+            yield _first_attitude(result)
+    yield _about(acceptance, results, rows)
+    names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
+    yield Card("Signed", words=[names])
+
+
+def _failed_rows(result: SetResult) -> Iterator[tuple[str, int, str]]:
+    """The failed cases of a set: how many by reason."""
+    for why, count in result.failed.items():
+        yield result.case_set.name, count, why
+
+
+def _asked(verdicts: list[ClauseVerdict], result: SetResult, quantity: str) -> bool:
+    name = result.case_set.name
+    return result.cases is not None and any(
+        each.clause.of == name and each.clause.quantity == quantity for each in verdicts
+    )
+
+
+def _clauses(verdicts: list[ClauseVerdict]) -> Card:
+    rows = []
+    for each in verdicts:
+        verdict = each.verdict
+        if verdict is None:
+            continue
+        chip = f'<span class="chip" data-state="{STATES[each.word]}">{each.word}</span>'
+        guard = f"{verdict.guard:.2g} {each.unit}" if verdict.guard else ""
+        margin = None if verdict.margin is None else f"{verdict.margin:.3g} {each.unit}".rstrip()
+        figures = (_requirement(each), _measured(each), guard, margin, Markup(chip))
+        rows.append((each.clause.capability, *figures, verdict.cases, _more(each), verdict.method))
+    texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
+    return Card("Clauses", words=texts, cure=CURES.get(verdict_of(verdicts), ""))
+
+
+def _untested(acceptance: Acceptance, verdicts: list[ClauseVerdict]) -> Card:
+    rows = []
+    for each in verdicts:
+        if each.verdict is None:
+            rows.append((each.clause.capability, each.untested))
+    rows += [(each.capability, each.why) for each in acceptance.plan.untested]
+    if not rows:
+        return Card("Not tested", words=[paragraph("Every clause of the plan was tested.")])
+    return Card("Not tested", words=[table_of(rows, ("capability", "why"))])
+
+
+def _sweep_card(result: SetResult) -> Card:
+    """The share of successes at each level of a sweep, with its interval."""
+    sweep = result.case_set.sweep
+    assert sweep is not None
+    levels = list(levels_text(result.levels))
+    at = [level for level, _, _ in levels]
+    share = [successes / cases for _, successes, cases in levels]
+    ends = [clopper_pearson(successes, cases, 0.975) for _, successes, cases in levels]
+    bars = np.abs(np.array(ends).T - np.array(share))
+    unit = f" [{sweep.unit}]" if sweep.unit else ""
+    with panels_of(f"Share of cases with an attitude against {sweep.key}") as (axes,):
+        axes.errorbar(at, share, yerr=bars, fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
+        axes.axhline(sweep.share, linewidth=0.8, linestyle="--", color=MUTED)
+        axes.set_ylim(-0.05, 1.05)
+        if sweep.scale == "log":
+            axes.set_xscale("log")
+        axes.set_xlabel(f"{sweep.key}{unit}")
+        axes.set_ylabel("share of cases")
+    table = table_of(levels, (f"level{unit}", "successes", "cases"))
+    words = [paragraph(result.case_set.about)] if result.case_set.about else []
+    words.append(drawing_of(axes.figure, f"share of cases with an attitude against {sweep.key}"))
+    return Card(f"Sweep: {result.case_set.name}", words=words, details=[table])
+
+
+def _first_attitude(result: SetResult) -> Card:
+    """The distribution of the time to the first attitude."""
+    assert result.cases is not None
+    column = result.cases.numbers["first_attitude_s"]
+    times = np.sort(np.where(np.isfinite(column), column, math.inf))
+    rows = []
+    for share in QUANTILES:
+        low, high = quantile_limits(times, share, 0.975)
+        value = float(times[min(math.ceil(share * len(times)), len(times)) - 1])
+        rows.append((f"{100 * share:g} %", *(_seconds(part) for part in (value, low, high))))
+    known = times[np.isfinite(times)]
+    with panels_of("Time to the first attitude") as (axes,):
+        axes.step(known, np.arange(1, len(known) + 1) / len(times), where="post", color=BLUE)
+        axes.set_ylim(0, 1.05)
+        axes.set_xlabel("time to the first attitude [s]")
+        axes.set_ylabel("share of cases")
+    header = ("share of cases", "within [s]", "from (95 %)", "to")
+    words = [drawing_of(axes.figure, "distribution of the time to the first attitude")]
+    words.append(table_of(rows, header))
+    return Card(f"Time to the first attitude: {result.case_set.name}", words=words)
+
+
+def _seconds(value: float) -> str:
+    if math.isfinite(value):
+        return f"{value:.4g}"
+    return "more than was waited" if value > 0 else DASH
+
+
+def _about(acceptance: Acceptance, results: list[SetResult], rows: int) -> Card:
+    plan = acceptance.plan
+    file = acceptance.file
+    ledger_sha256 = file_sha256(acceptance.directory / LEDGER)
+    about: list[tuple[str, str]] = [
+        ("plan", str(plan.path)),
+        ("bench", f"{file.path}, sha256 {file.sha256}"),
+        ("through", plan.through),
+        ("program", f"hilstar {__version__}"),
+        ("ledger", f"{rows} cases in {LEDGER}, sha256 {ledger_sha256}"),
+    ]
+    if acceptance.certificate is not None:
+        found = acceptance.certificate
+        about.append(("certificate", f"{found.line}; {off_by(found)}"))
+    elif acceptance.on_bench:
+        about.append(("certificate", "none: the bench's own uncertainty is not taken off"))
+    cube = acceptance.cube
+    if cube is not None:
+        about.append(("cube to boresight", cube.line))
+    sets = []
+    for result in results:
+        cases = sum(count.cases for count in result.levels)
+        if result.cases is not None:
+            cases = result.cases.cases
+        sets.append((result.case_set.name, cases, result.case_set.about))
+    table = table_of(sets, ("set of cases", "cases", "what"))
+    return Card("Bench, plan and ledger", words=[table_of(about), table])

@@ -1,0 +1,455 @@
+"""Figures of what answers carry beside the attitude: rates, times of measurement, single stars; and
+the aberration that a tracker leaves.
+
+Each is a linear fit or a mean over frames or stars, with the case as the unit that is independent
+of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps draw cases.
+
+    rate       reported minus commanded = bias + scale x rate - lag x acceleration, by axis
+    time       error = bias of each axis + (stamp's bias) x rate; what a late stamp adds is along
+               the motion, and turns its sign with the slew
+    jitter     along a slew the error's variance exceeds that across it by (rate x jitter)^2
+    aberration error = bias + share x the turn by v / c; a share of 1 leaves it all
+    stars      place error = a smooth map over the detector + noise; signal against B-V; a logistic
+               curve of detection against V
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize, stats
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.instruments.campaign.cases import (
+    AXES,
+    FALSE_STARS,
+    FRAME_ERRORS,
+    FRAME_RATE_ERRORS,
+    FRAME_RATES,
+    REPORTED_FRAMES,
+    STAR_LISTS,
+    Q,
+)
+from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
+from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.planted import aberration_rad
+from hilstar.instruments.campaign.results import VARY, Columns
+from hilstar.optics.camera import field_terms
+
+MIN_CASES = 8
+MAP_DEGREE = 5  # of the polynomials of a star's place error over the detector
+WILD_SIGMAS = 6.0
+ACROSS_SHARE = 0.3  # largest part of a slew's rate about the boresight, for the jitter
+SMALL_RATE_DEG_S = 1e-6
+LIMIT_BIN_MAG = 0.05
+LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
+MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
+SILENT = "the answers carry no {}"
+
+
+@dataclass(frozen=True, slots=True)
+class CaseFit:
+    """A least-squares fit over rows of cases: coefficients (k,), their covariance (k, k) by cases,
+    the residuals (n,), and the number of cases.
+    """
+
+    value: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    cases: int
+
+
+def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> CaseFit:
+    """Fit values (n,) by a design (n, k); rows of one `case` (n,) go together."""
+    inverse = np.linalg.pinv(design.T @ design)
+    value = inverse @ (design.T @ values)
+    residual = values - design @ value
+    number = np.unique(case, return_inverse=True)[1].reshape(-1)
+    cases = int(number.max()) + 1
+    score = np.zeros((cases, design.shape[1]))
+    np.add.at(score, number, design * residual[:, None])
+    free = max(cases - design.shape[1], 1)
+    covariance = inverse @ (score.T @ score) @ inverse * cases / free
+    return CaseFit(value, covariance, residual, cases)
+
+
+def answer_figure(
+    require: Require,
+    cases: Columns,
+    axes: list[int],
+    resolution_px: tuple[int, int],
+    rng: np.random.Generator,
+) -> BoundedFigure:
+    """The figure that a requirement limits. Raises TooFewCases where the cases do not tell it."""
+    quantity = require.quantity
+    if quantity.startswith("rate-"):
+        return _rate_figure(require, cases, axes, rng)
+    if quantity.startswith("time-"):
+        return _time_figure(require, cases, rng)
+    if quantity == "aberration":
+        return _aberration(require, cases)
+    found = StarTable.of(cases)
+    figures: dict[str, Callable[[], BoundedFigure]] = {
+        "star-noise": lambda: _star_places(require, found, resolution_px, rng, noise=True),
+        "star-fov-error": lambda: _star_places(require, found, resolution_px, rng, noise=False),
+        "star-colour": lambda: _star_colour(require, found),
+        "star-limit": lambda: _star_limit(require, found, rng),
+        "false-stars": lambda: _false_stars(require, cases, rng),
+    }
+    return figures[quantity]()
+
+
+def _joined(cases: Columns, names: tuple[str, ...]) -> tuple[FloatArray, IntArray]:
+    """Lists of columns side by side (n, k), and the case of each row (n,)."""
+    lists = [cases.lists.get(name, []) for name in names]
+    counts = [len(values) for values in lists[0]]
+    case = np.repeat(np.arange(len(counts)), counts)
+    if not len(case):
+        return np.zeros((0, len(names))), case
+    return np.stack([np.concatenate(column) for column in lists], axis=1), case
+
+
+def _enough(case: IntArray, what: str) -> None:
+    """Refuse (TooFewCases) rows of too few cases."""
+    cases = len(np.unique(case))
+    if not cases:
+        raise TooFewCases(SILENT.format(what), 0)
+    if cases < MIN_CASES:
+        why = f"{cases} cases tell it, and {MIN_CASES} are needed"
+        raise TooFewCases(why, cases, MIN_CASES - cases)
+
+
+def _size(
+    value: FloatArray, sigma: FloatArray, cases: int, confidence: float, method: str
+) -> BoundedFigure:
+    """The largest size of coefficients (k,) with its limits by Student's t."""
+    size = np.abs(value)
+    freedom = max(cases - 2, 1)
+    upper = float(stats.t.ppf(confidence, freedom))
+    # Bonferroni: of several axes any one may be the larger
+    lower = float(stats.t.ppf(1 - (1 - confidence) / len(size), freedom))
+    low = max(float((size - lower * sigma).max()), 0.0)
+    high = float((size + upper * sigma).max())
+    return BoundedFigure(float(size.max()), low, high, cases, method)
+
+
+def _root_mean(
+    squares: FloatArray,
+    weights: FloatArray,
+    case: IntArray,
+    require: Require,
+    rng: np.random.Generator,
+    method: str = "bootstrap over cases",
+) -> BoundedFigure:
+    """The root of the sum of squares (n,) over that of weights (n,), by the bootstrap over cases;
+    squares may be below 0.
+    """
+    number = np.unique(case, return_inverse=True)[1].reshape(-1)
+    sums, whole = (_summed(values, number) for values in (squares, weights))
+    drawn = drawn_limits(sums, whole, rng, require.confidence)
+    value = math.sqrt(max(float(sums.sum() / whole.sum()), 0.0))
+    low, high = np.sqrt(np.maximum(drawn, 0.0)).tolist()
+    return BoundedFigure(value, min(low, value), max(high, value), len(sums), method)
+
+
+def _summed(values: FloatArray, number: IntArray) -> FloatArray:
+    """Sums of values (n,) by the number of their case."""
+    return np.asarray(np.bincount(number, values), dtype=np.float64)
+
+
+# ---- angular rate ----
+
+
+def _rate_figure(
+    require: Require, cases: Columns, axes: list[int], rng: np.random.Generator
+) -> BoundedFigure:
+    rates, case = _joined(cases, FRAME_RATES)
+    errors, _ = _joined(cases, FRAME_RATE_ERRORS)
+    if not len(errors):
+        raise TooFewCases(SILENT.format("rate"), 0)
+    known = np.isfinite(errors).all(axis=1)
+    rates, errors, case = rates[known], errors[known], case[known]
+    _enough(case, "rate")
+    accelerations = _accelerations(cases)[case]
+    fits = [_rate_fit(errors[:, k], rates[:, k], accelerations[:, k], case) for k in axes]
+    quantity = require.quantity
+    if quantity == "rate-noise":
+        residual = np.stack([fit.residual for fit in fits], axis=1)
+        freedom = max(len(case) - 3, 1) / len(case)
+        squares = (residual**2).mean(axis=1) / freedom
+        return _root_mean(squares, np.ones(len(case)), case, require, rng)
+    column = {"rate-bias": 0, "rate-scale": 1, "rate-lag": 2}[quantity]
+    spread = (rates, accelerations)[column - 1] if column else None
+    if spread is not None and not np.ptp(spread[:, axes], axis=0).all():
+        what = "turns at several rates" if column == 1 else "accelerates"
+        raise TooFewCases(f"no case {what} about that axis", fits[0].cases)
+    value = np.array([fit.value[column] for fit in fits])
+    sigma = np.sqrt(np.array([fit.covariance[column, column] for fit in fits]))
+    return _size(value, sigma, fits[0].cases, require.confidence, "linear fit, Student's t")
+
+
+def _rate_fit(
+    error: FloatArray, rate: FloatArray, acceleration: FloatArray, case: IntArray
+) -> CaseFit:
+    design = np.stack([np.ones(len(rate)), rate, -acceleration], axis=1)
+    return fit_by_cases(design, error, case)
+
+
+def _accelerations(cases: Columns) -> FloatArray:
+    """The angular acceleration of each case (n, 3), deg/s2."""
+    count = len(cases.numbers["frames"])
+    columns = []
+    for axis in AXES:
+        columns.append(cases.numbers.get(f"{VARY}acceleration_deg_s2.{axis}", np.zeros(count)))
+    return np.stack(columns, axis=1)
+
+
+# ---- time of measurement ----
+
+
+def _time_figure(require: Require, cases: Columns, rng: np.random.Generator) -> BoundedFigure:
+    errors, case = _joined(cases, FRAME_ERRORS)
+    rates_deg_s, _ = _joined(cases, FRAME_RATES)
+    _enough(case, "attitude")
+    rates = 3600.0 * rates_deg_s
+    turning = np.abs(rates_deg_s).max(axis=1) > SMALL_RATE_DEG_S
+    if not turning.any() or np.ptp(np.sign(rates[turning]), axis=0).max() < 2:
+        raise TooFewCases(
+            "slews of both signs tell it, and the cases have none", len(np.unique(case))
+        )
+    noise = MAD_TO_SIGMA * np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
+    noise = np.maximum(noise, 1e-9)
+    design = np.zeros((3 * len(case), 4))
+    for k in range(3):
+        rows = slice(k * len(case), (k + 1) * len(case))
+        design[rows, k] = 1 / noise[k]
+        design[rows, 3] = rates[:, k] / noise[k]
+    fit = fit_by_cases(design, (errors / noise).T.ravel(), np.tile(case, 3))
+    if require.quantity == "time-bias":
+        sigma = math.sqrt(float(fit.covariance[3, 3]))
+        method = "linear fit over slews of both signs, Student's t"
+        value = fit.value[3:]
+        return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
+    residual = fit.residual.reshape(3, -1).T * noise
+    return _jitter(require, residual, rates, case, rng)
+
+
+def _jitter(
+    require: Require,
+    residual: FloatArray,
+    rates: FloatArray,
+    case: IntArray,
+    rng: np.random.Generator,
+) -> BoundedFigure:
+    """The jitter of the stamp, s, from residuals (n, 3), arcsec, at rates (n, 3), arcsec/s."""
+    speed = np.linalg.norm(rates, axis=1)
+    slews = (speed > 3600 * SMALL_RATE_DEG_S) & (np.abs(rates[:, 2]) <= ACROSS_SHARE * speed)
+    if len(np.unique(case[slews])) < MIN_CASES:
+        raise TooFewCases("slews across the boresight tell it, and there are too few", 0)
+    # the direction of the slew in the image plane, in which the noise has no preferred one
+    across = rates[slews, :2]
+    along = across / np.linalg.norm(across, axis=1, keepdims=True)
+    off = residual[slews]
+    parallel = (off[:, :2] * along).sum(axis=1)
+    normal = off[:, 1] * along[:, 0] - off[:, 0] * along[:, 1]
+    excess = parallel**2 - normal**2
+    square = (across**2).sum(axis=1)
+    method = "excess of the error along slews over that across them, bootstrap over cases"
+    return _root_mean(excess * square, square**2, case[slews], require, rng, method)
+
+
+# ---- aberration ----
+
+
+def _aberration(require: Require, cases: Columns) -> BoundedFigure:
+    errors = cases.vectors("error_{}_arcsec", "xyz")[:, :2]
+    count = len(errors)
+    velocity = []
+    for k in range(3):
+        name = f"{VARY}sky.observer_velocity_km_s.{k}"
+        velocity.append(cases.numbers.get(name, np.zeros(count)))
+    q = np.stack([cases.numbers[name] for name in Q], axis=1)
+    known = np.isfinite(errors).all(axis=1) & np.isfinite(q).all(axis=1)
+    velocities = np.stack(velocity, axis=1)
+    if not known.any() or not np.ptp(velocities[known], axis=0).any():
+        raise TooFewCases("cases at several velocities of the observer tell it", int(known.sum()))
+    case = np.flatnonzero(known)
+    _enough(case, "attitude")
+    turns = [aberration_rad(q[k], velocities[k])[:2] for k in case]
+    predicted = ARCSEC_PER_RAD * np.array(turns)
+    design = np.zeros((2 * len(case), 3))
+    for k in range(2):
+        rows = slice(k * len(case), (k + 1) * len(case))
+        design[rows, k] = 1.0
+        design[rows, 2] = predicted[:, k]
+    fit = fit_by_cases(design, errors[case].T.ravel(), np.tile(case, 2))
+    sigma = math.sqrt(float(fit.covariance[2, 2]))
+    method = "linear fit over the observer's velocity, Student's t"
+    return _size(fit.value[2:], np.array([sigma]), fit.cases, require.confidence, method)
+
+
+# ---- single stars ----
+
+
+@dataclass(frozen=True, slots=True)
+class StarTable:
+    """Lit stars (n,) of all cases and their reports, by the names of STAR_LISTS; `case` (n,)."""
+
+    case: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+    v_mag: FloatArray
+    bv: FloatArray
+    dx_px: FloatArray
+    dy_px: FloatArray
+    signal_mag: FloatArray
+
+    @classmethod
+    def of(cls, cases: Columns) -> "StarTable":
+        """The stars of a campaign's table. Raises TooFewCases where no star is reported."""
+        rows, case = _joined(cases, STAR_LISTS)
+        if not len(rows) or not np.isfinite(rows[:, 4]).any():
+            raise TooFewCases(SILENT.format("single stars"), 0)
+        return cls(case, *rows.T)
+
+    @property
+    def found(self) -> npt.NDArray[np.bool_]:
+        """Which stars (n,) were reported."""
+        return np.isfinite(self.dx_px)
+
+
+def _star_places(
+    require: Require,
+    found: StarTable,
+    resolution_px: tuple[int, int],
+    rng: np.random.Generator,
+    *,
+    noise: bool,
+) -> BoundedFigure:
+    """The noise of stars' places, or the rms of their map, px an axis."""
+    kept = np.flatnonzero(found.found)
+    offsets = np.stack([found.dx_px, found.dy_px], axis=1)[kept]
+    terms = field_terms(found.x_px[kept], found.y_px[kept], resolution_px, MAP_DEGREE)
+    near = np.ones(len(kept), dtype=np.bool_)
+    for _ in range(3):
+        if near.sum() < 4 * terms.shape[1]:
+            more = 4 * terms.shape[1]
+            raise TooFewCases(f"{int(near.sum())} stars, and {more} are needed for a map", 0)
+        solution = np.linalg.lstsq(terms[near], offsets[near], rcond=None)[0]
+        residual = offsets - terms @ solution
+        spread = MAD_TO_SIGMA * np.median(np.abs(residual[near]), axis=0)
+        close = np.abs(residual) <= WILD_SIGMAS * np.maximum(spread, 1e-9)
+        near = np.asarray(close.all(axis=1), dtype=np.bool_)
+    count = int(near.sum())
+    freedom = count - terms.shape[1]
+    case = found.case[kept][near]
+    number = np.unique(case, return_inverse=True)[1].reshape(-1)
+    variance = float((residual[near] ** 2).sum()) / (2 * freedom)
+    method = f"map of degree {MAP_DEGREE} over {count} stars, bootstrap over cases"
+    if noise:
+        squares = (residual[near] ** 2).mean(axis=1) * count / freedom
+        return _root_mean(squares, np.ones(count), case, require, rng, method)
+    fitted = terms[near] @ solution
+    fitted = fitted - fitted.mean(axis=0)
+    # what the noise alone puts into so many terms
+    taken = variance * (terms.shape[1] - 1) / count
+    sums = _summed((fitted**2).mean(axis=1), number)
+    counts = _summed(np.ones(count), number)
+    low, high = drawn_limits(sums, counts, rng, require.confidence)
+    power = float(sums.sum() / counts.sum()) - taken
+    # the spread of the fit's own power by noise: each term has one degree of freedom an axis
+    free = 2 * (terms.shape[1] - 1)
+    hidden = float(stats.norm.ppf(require.confidence)) * taken * math.sqrt(2 / free)
+    hidden += 2 * math.sqrt(max(power, 0.0) * variance / (2 * count))
+    upper = max(float(high) - taken, power) + hidden
+    lower = min(float(low) - taken, power) - hidden
+    value = math.sqrt(max(power, 0.0))
+    limits = math.sqrt(max(lower, 0.0)), math.sqrt(max(upper, 0.0))
+    return BoundedFigure(value, *limits, len(counts), method)
+
+
+def _star_colour(require: Require, found: StarTable) -> BoundedFigure:
+    """How a star's signal goes with its B-V, magnitudes a magnitude."""
+    known = np.isfinite(found.signal_mag) & np.isfinite(found.bv)
+    _enough(found.case[known], "stars' signal")
+    signal = found.signal_mag[known]
+    off = np.abs(signal - np.median(signal))
+    near = off <= WILD_SIGMAS * MAD_TO_SIGMA * max(float(np.median(off)), 1e-9)
+    bv = found.bv[known][near]
+    design = np.stack([np.ones(len(bv)), bv], axis=1)
+    fit = fit_by_cases(design, signal[near], found.case[known][near])
+    sigma = math.sqrt(float(fit.covariance[1, 1]))
+    method = f"linear fit over B-V of {len(bv)} stars, Student's t"
+    return _size(fit.value[1:], np.array([sigma]), fit.cases, require.confidence, method)
+
+
+def _star_limit(require: Require, found: StarTable, rng: np.random.Generator) -> BoundedFigure:
+    """The V at which half of the stars are reported."""
+    _enough(found.case, "single stars")
+    place = np.floor(found.v_mag / LIMIT_BIN_MAG).astype(np.int64)
+    first = int(place.min())
+    bins = int(place.max()) - first + 1
+    number = np.unique(found.case, return_inverse=True)[1].reshape(-1)
+    cases = int(number.max()) + 1
+    shape = (cases, bins)
+    index = number * bins + place - first
+    lit = np.bincount(index, minlength=cases * bins).reshape(shape)
+    seen = np.bincount(index[found.found], minlength=cases * bins).reshape(shape)
+    middle_mag = np.asarray((np.arange(bins) + first + 0.5) * LIMIT_BIN_MAG, dtype=np.float64)
+    value = half_seen(middle_mag, seen.sum(axis=0), lit.sum(axis=0))
+    drawn = []
+    for _ in range(LIMIT_DRAWS):
+        chosen = rng.integers(0, cases, cases)
+        drawn.append(half_seen(middle_mag, seen[chosen].sum(axis=0), lit[chosen].sum(axis=0)))
+    low, high = np.quantile(drawn, [1 - require.confidence, require.confidence])
+    # a curve that is sharper than a bin is known to within one
+    low = min(float(low), value) - LIMIT_BIN_MAG / 2
+    high = max(float(high), value) + LIMIT_BIN_MAG / 2
+    method = f"logistic curve over {int(lit.sum())} stars, bootstrap over cases"
+    if high >= middle_mag[-1]:
+        high = math.inf
+        method += "; sky.faintest_v_mag bounds it"
+    return BoundedFigure(value, low, high, cases, method)
+
+
+def half_seen(v_mag: FloatArray, seen: IntArray, lit: IntArray) -> float:
+    """The magnitude at which a logistic curve of detection falls to a half: counts of stars seen
+    (n,) of those lit (n,) at magnitudes (n,).
+    """
+
+    def loss(parameters: FloatArray) -> float:
+        limit_mag, log_width = parameters
+        width = MIN_SLOPE_MAG + math.exp(log_width)
+        share = stats.logistic.cdf((limit_mag - v_mag) / width)
+        share = np.clip(share, 1e-9, 1 - 1e-9)
+        return -float((seen * np.log(share) + (lit - seen) * np.log1p(-share)).sum())
+
+    # begun where the counts split best by one magnitude
+    missed = np.concatenate([[0], np.cumsum(lit - seen)])
+    beyond = np.concatenate([np.cumsum(seen[::-1])[::-1], [0]])
+    cut = int(np.argmin(missed + beyond))
+    edges = np.concatenate([v_mag - LIMIT_BIN_MAG / 2, [v_mag[-1] + LIMIT_BIN_MAG / 2]])
+    start = np.array([edges[cut], math.log(0.1)])
+    found = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
+    return float(min(max(found.x[0], v_mag[0]), v_mag[-1]))
+
+
+def _false_stars(require: Require, cases: Columns, rng: np.random.Generator) -> BoundedFigure:
+    """False stars a frame."""
+    frames, false = (cases.numbers[name] for name in (REPORTED_FRAMES, FALSE_STARS))
+    some = frames > 0
+    count = int(some.sum())
+    if not count:
+        raise TooFewCases(SILENT.format("single stars"), 0)
+    total = float(false[some].sum())
+    exposed = float(frames[some].sum())
+    c = require.confidence
+    low = float(stats.gamma.ppf(1 - c, total)) / exposed if total else 0.0
+    high = float(stats.gamma.ppf(c, total + 1)) / exposed
+    drawn = drawn_limits(false[some], frames[some], rng, c)
+    low, high = min(low, float(drawn[0])), max(high, float(drawn[1]))
+    method = "Poisson, or the bootstrap over cases where that is wider"
+    return BoundedFigure(total / exposed, low, high, count, method)

@@ -1,0 +1,86 @@
+"""Figures of cases with their one-sided limits, and the statistics that give such limits."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from hilstar.basics.arrays import FloatArray
+
+MAX_BLOCKS, DRAWS = 200, 1000  # the bootstrap's
+
+
+@dataclass(frozen=True, slots=True)
+class BoundedFigure:
+    """A figure with its one-sided limits; `rate` (count, of) is what decides how many cases are
+    wanted.
+    """
+
+    value: float
+    low: float
+    high: float
+    cases: int
+    method: str
+    rate: tuple[float, float] | None = None
+
+
+class TooFewCases(Exception):
+    """Why a figure is not known, with how many more cases could give it (None: cases alone
+    cannot).
+    """
+
+    def __init__(self, why: str, cases: int, more: int | None = None) -> None:
+        super().__init__(why)
+        self.cases = cases
+        self.more = more
+
+
+def clopper_pearson(count: float, of: float, confidence: float) -> tuple[float, float]:
+    """The one-sided limits of a rate of which `count` in `of` were seen, each at this
+    confidence.
+    """
+    if count <= 0:
+        low = 0.0
+    else:
+        low = float(stats.beta.ppf(1 - confidence, count, of - count + 1))
+    if count >= of:
+        high = 1.0
+    else:
+        high = float(stats.beta.ppf(confidence, count + 1, of - count))
+    return low, high
+
+
+def quantile_limits(values: FloatArray, share: float, confidence: float) -> tuple[float, float]:
+    """One-sided limits of the `share` quantile of values (n,) by order statistics; infinite
+    where there are too few.
+    """
+    ordered = np.sort(values)
+    n = len(values)
+    # the smallest k with P(count <= k) >= confidence
+    upper = int(stats.binom.ppf(confidence, n, share))
+    lower = int(stats.binom.ppf(1 - confidence, n, share))
+    lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
+    return float(ordered[lower - 1]) if lower > 0 else -math.inf, (
+        float(ordered[upper]) if upper < n else math.inf
+    )
+
+
+def sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[float, float]:
+    """The one-sided limits of a sigma by chi-square, of Gaussian errors."""
+    low, high = (
+        variance * freedom / stats.chi2.ppf(p, freedom) for p in (confidence, 1 - confidence)
+    )
+    return math.sqrt(low), math.sqrt(high)
+
+
+def drawn_limits(
+    sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float
+) -> FloatArray:
+    """The limits (2,) of sum over weight of cases (n,), by the bootstrap over blocks of them."""
+    blocks = min(MAX_BLOCKS, len(sums))
+    block = np.arange(len(sums)) * blocks // len(sums)
+    total, weight = (np.bincount(block, values, blocks) for values in (sums, weights))
+    drawn = rng.integers(0, blocks, (DRAWS, blocks))
+    ratio = total[drawn].sum(axis=1) / np.maximum(weight[drawn].sum(axis=1), 1e-300)
+    return np.asarray(np.quantile(ratio, [1 - confidence, confidence]))

@@ -1,0 +1,185 @@
+"""The virtual tracker of a case: what a solver finds, as a tracker reports it, with the faults that
+a plan plants.
+
+A solver that tells no rate gets that of its last two attitudes, half a step old.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import (
+    from_radec_roll_deg,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rate_between_rad_s,
+    to_matrix,
+    to_radec_roll_deg,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S
+from hilstar.instruments.campaign.plan import PlantedFaults
+from hilstar.instruments.campaign.solver_answer import SolverAnswer
+from hilstar.instruments.simulate.simulator import Exposure
+from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.answers.stars import LitStars, judge_stars
+
+PLANTED_STREAM = 5  # stream of a case's noise seed for what is planted
+HEALTHY = PlantedFaults()
+FALSE_DN = 1000.0  # signal of a planted false star
+
+
+@dataclass(frozen=True, slots=True)
+class CaseConditions:
+    """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, the angular
+    acceleration, rad/s2, cam, the detector's false stars, and the end of the last fault, s (None:
+    none).
+    """
+
+    velocity_km_s: FloatArray
+    acceleration_rad_s2: FloatArray
+    false_stars: int = 0
+    fault_end_s: float | None = None
+
+
+class CaseTracker:
+    """Reports a case's answers, in the order of its frames."""
+
+    def __init__(
+        self,
+        planted: PlantedFaults | None,
+        noise_seed: int,
+        conditions: CaseConditions,
+        with_rate: bool,
+    ) -> None:
+        self._planted = HEALTHY if planted is None else planted
+        self._rng = np.random.default_rng((noise_seed, PLANTED_STREAM))
+        self._conditions = conditions
+        self._with_rate = with_rate
+        self._last: deque[tuple[float, FloatArray]] = deque(maxlen=2)
+
+    def reported(self, solved: SolverAnswer, exposure: Exposure, middle_s: float) -> SolverAnswer:
+        """What the tracker reports of an exposure whose middle is `middle_s` after the case's
+        begin.
+        """
+        answer = self._with_stars(self._with_own_rate(solved, middle_s), exposure)
+        why = self._silence(exposure, middle_s)
+        if why:
+            return replace(answer, q_icrs_to_cam=None, why=why, rate_cam_rad_s=None)
+        q = answer.q_icrs_to_cam
+        if q is None:
+            return answer
+        planted = self._planted
+        stamp_s = answer.stamp_s + planted.stamp_bias_s
+        stamp_s += planted.stamp_jitter_s * float(self._rng.standard_normal())
+        reported_q = self._turned(q)
+        rate_rad_s = self._rate(answer.rate_cam_rad_s)
+        return replace(answer, q_icrs_to_cam=reported_q, rate_cam_rad_s=rate_rad_s, stamp_s=stamp_s)
+
+    def _with_own_rate(self, solved: SolverAnswer, middle_s: float) -> SolverAnswer:
+        q = solved.q_icrs_to_cam
+        if q is None:
+            return solved
+        self._last.append((middle_s, q))
+        if not self._with_rate or solved.rate_cam_rad_s is not None or len(self._last) < 2:
+            return solved
+        (before_s, before_q), (now_s, now_q) = self._last
+        rate_rad_s = rate_between_rad_s(before_q, now_q, now_s - before_s)
+        return replace(solved, rate_cam_rad_s=rate_rad_s)
+
+    def _silence(self, exposure: Exposure, middle_s: float) -> str:
+        """Why the tracker reports no attitude by a planted fault; "" where it reports one."""
+        planted = self._planted
+        if self._rng.random() < planted.missing:
+            return "planted: missing"
+        if middle_s < planted.acquisition_s:
+            return "planted: acquisition_s"
+        end_s = self._conditions.fault_end_s
+        if planted.recovery_s and end_s is not None and 0 <= middle_s - end_s < planted.recovery_s:
+            return "planted: recovery_s"
+        rate_deg_s = math.degrees(float(np.linalg.norm(exposure.view.turn.rate_cam_rad_s)))
+        if planted.max_rate_deg_s is not None and rate_deg_s > planted.max_rate_deg_s:
+            return "planted: max_rate_deg_s"
+        limit = planted.max_false_stars
+        if limit is not None and self._conditions.false_stars > limit:
+            return "planted: max_false_stars"
+        return ""
+
+    def _turned(self, q: FloatArray) -> FloatArray:
+        planted = self._planted
+        if self._rng.random() < planted.wrong:
+            return normalise(self._rng.normal(size=4))
+        if planted.lost_roll:
+            ra_deg, dec_deg, _ = to_radec_roll_deg(q)
+            q = from_radec_roll_deg(ra_deg, dec_deg, float(self._rng.uniform(0, 360)))
+        noise = np.array(planted.noise_arcsec) * self._rng.standard_normal(3)
+        error_rad = (np.array(planted.bias_arcsec) + noise) / ARCSEC_PER_RAD
+        error_rad = error_rad + planted.aberration * aberration_rad(
+            q, self._conditions.velocity_km_s
+        )
+        return multiply(from_rotation_vector(error_rad), q)
+
+    def _rate(self, rate_rad_s: FloatArray | None) -> FloatArray | None:
+        if rate_rad_s is None:
+            return None
+        planted = self._planted
+        noise = planted.rate_noise_deg_s * self._rng.standard_normal(3)
+        error_rad_s = np.radians(np.array(planted.rate_bias_deg_s) + noise)
+        error_rad_s -= planted.rate_lag_s * self._conditions.acceleration_rad_s2
+        return np.asarray((1 + planted.rate_scale) * rate_rad_s + error_rad_s)
+
+    def _with_stars(self, answer: SolverAnswer, exposure: Exposure) -> SolverAnswer:
+        """The answer with planted faults of its stars."""
+        if answer.stars is None or self._planted == HEALTHY:
+            return answer
+        planted = self._planted
+        height, width = exposure.dn.shape
+        lit = lit_stars(exposure)
+        stars = []
+        for star in answer.stars:
+            match = judge_stars((star,), lit, (width, height))
+            found = np.flatnonzero(np.isfinite(match.dx_px))
+            v_mag = match.lit.v_mag[found]
+            limit = planted.star_limit_v_mag
+            if limit is not None and (not len(found) or v_mag[0] > limit):
+                continue
+            wave = math.sqrt(2) * planted.star_fov_px
+            wave_x_px = wave * math.sin(2 * math.pi * star.x_px / width)
+            wave_y_px = wave * math.sin(2 * math.pi * star.y_px / height)
+            noise_px = planted.star_noise_px * self._rng.standard_normal(2)
+            dn = star.dn
+            if dn is not None and len(found):
+                dn *= 10 ** (-0.4 * planted.star_colour * float(match.lit.bv[found[0]]))
+            x_px = star.x_px + float(noise_px[0]) + wave_x_px
+            y_px = star.y_px + float(noise_px[1]) + wave_y_px
+            stars.append(ReportedStar(x_px, y_px, dn, star.hip))
+        for _ in range(int(self._rng.poisson(planted.false_stars))):
+            x_px = float(self._rng.uniform(0, width - 1))
+            y_px = float(self._rng.uniform(0, height - 1))
+            stars.append(ReportedStar(x_px, y_px, FALSE_DN))
+        return replace(answer, stars=tuple(stars))
+
+
+def aberration_rad(q_icrs_to_cam: FloatArray, velocity_km_s: FloatArray) -> FloatArray:
+    """The rotation vector (3,), cam, by which an attitude is off that takes the aberration of this
+    velocity (3,), ICRS, for none: stars on the boresight move by v / c towards it.
+    """
+    v_cam = to_matrix(q_icrs_to_cam) @ velocity_km_s / LIGHT_KM_S
+    return np.array([-v_cam[1], v_cam[0], 0.0])
+
+
+def lit_stars(exposure: Exposure) -> LitStars:
+    """The stars that an exposure has within its detector, without those of faults."""
+    truth = exposure.truth
+    height, width = exposure.dn.shape
+    with np.errstate(invalid="ignore"):
+        off_x = np.abs(truth["x_px"] - (width - 1) / 2)
+        off_y = np.abs(truth["y_px"] - (height - 1) / 2)
+        inside = (off_x <= width / 2) & (off_y <= height / 2)
+    real = ~np.isin(truth["name"], exposure.faults) if exposure.faults else inside
+    seen = truth[inside & real & truth["drawn"] & (truth["electrons_per_s"] > 0)]
+    names = ("x_px", "y_px", "v_mag", "bv", "electrons_per_s")
+    return LitStars(*(np.asarray(seen[name], dtype=np.float64) for name in names))

@@ -1,0 +1,165 @@
+"""A sweep with an edge: the value of a key at which a tracker stops answering, by bisection.
+
+Both ends come first, then the middle of the bracket, again and again; at each level so many cases
+are run. Where it still answers at the stop, and that is not shown, levels before it follow. A case
+is a success where at least half of its frames have a right answer. The edge is where the share of
+successes falls below `share`.
+
+**Interval.** Successes are taken to become rarer along the sweep, and nothing else. The edge is
+beyond each level whose share is shown to be larger than `share`, and before each level whose share
+is shown to be smaller: Clopper and Pearson, with the error shared among the levels (Bonferroni).
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from hilstar.basics.errors import InputError
+from hilstar.basics.toml_tables import Table
+from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, clopper_pearson
+from hilstar.instruments.campaign.plan import Number
+from hilstar.instruments.campaign.results import Columns
+
+ENDS = 2  # levels before the first middle
+DEFAULT_CONFIDENCE = 0.95  # by which levels are chosen, whatever the clauses' own
+
+
+class SweepTable(Table, frozen=True):
+    """[cases.NAME.sweep]: a key from `start`, where the tracker answers, to `stop`, where it does
+    not any more.
+    """
+
+    key: Annotated[str, Meta(min_length=1, max_length=200)]
+    start: Number
+    stop: Number
+    scale: Literal["linear", "log"] = "linear"
+    rounds: Annotated[int, Meta(ge=1, le=20)] = 6
+    share: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.5
+    whole: bool = False
+    unit: Annotated[str, Meta(max_length=20)] = ""
+
+    def check(self, where: str) -> None:
+        """Refuse (InputError) ends that make no sweep."""
+        if self.start == self.stop:
+            raise InputError(f"{where}: start and stop are both {self.start:g}; write two numbers")
+        if self.scale == "log" and min(self.start, self.stop) <= 0:
+            raise InputError(f'{where}: scale = "log" needs numbers above 0; write such ones')
+
+    @property
+    def levels(self) -> int:
+        """The largest number of levels."""
+        return ENDS + self.rounds
+
+    def between(self, first: float, second: float) -> float:
+        """The level in the middle of two; of a `whole` key a whole number."""
+        if self.scale == "log":
+            middle = math.sqrt(first * second)
+        else:
+            middle = (first + second) / 2
+        return float(round(middle)) if self.whole else middle
+
+    def shown(self, count: "LevelCount", confidence: float) -> tuple[bool, bool]:
+        """Whether a level's share is shown to be at least, and to be below, the edge's; the error
+        is shared among the levels.
+        """
+        shared = 1 - (1 - confidence) / self.levels
+        low, high = clopper_pearson(count.successes, count.cases, shared)
+        return low >= self.share, high < self.share
+
+
+@dataclass(frozen=True, slots=True)
+class LevelCount:
+    """How many of a level's cases were successes."""
+
+    level: float
+    successes: int
+    cases: int
+
+    @property
+    def passed(self) -> bool:
+        """Whether at least half were."""
+        return 2 * self.successes >= self.cases
+
+
+def counted(level: float, cases: Columns) -> LevelCount:
+    """The successes among the cases of a level."""
+    numbers = cases.numbers
+    right = np.nan_to_num(numbers["solved"]) - np.nan_to_num(numbers["wrong"])
+    frames = np.nan_to_num(numbers["frames"])
+    success = (frames > 0) & (2 * right >= frames)
+    return LevelCount(level, int(success.sum()), len(success))
+
+
+def next_level(sweep: SweepTable, counts: list[LevelCount]) -> float | None:
+    """The level to run after these, in the order in which they were run; None at the end."""
+    if len(counts) < ENDS:
+        return (sweep.start, sweep.stop)[len(counts)]
+    if not counts[0].passed or len(counts) >= sweep.levels:
+        return None
+    if counts[1].passed:
+        good, bad = _unshown(sweep, counts)
+    else:
+        good, bad = sweep.start, sweep.stop
+        for count in counts[ENDS:]:
+            if count.passed:
+                good = count.level
+            else:
+                bad = count.level
+    level = sweep.between(good, bad)
+    return None if level in (good, bad) else level
+
+
+def _unshown(sweep: SweepTable, counts: list[LevelCount]) -> tuple[float, float]:
+    """Where it still answers at the stop: the farthest level that is shown to answer, and the next
+    one, so that the edge's lower limit comes up; the stop twice where that is shown.
+    """
+    ordered = sorted(counts, key=lambda count: abs(count.level - sweep.start))
+    shown = [count.level for count in ordered if sweep.shown(count, DEFAULT_CONFIDENCE)[0]]
+    if not shown:
+        return sweep.start, sweep.start
+    levels = [count.level for count in ordered]
+    following = levels.index(shown[-1]) + 1
+    return shown[-1], levels[min(following, len(levels) - 1)]
+
+
+def edge_figure(sweep: SweepTable, counts: list[LevelCount], confidence: float) -> BoundedFigure:
+    """The edge with its one-sided limits. Raises TooFewCases where no case was run."""
+    if not counts:
+        raise TooFewCases("no level was run", 0)
+    cases = sum(count.cases for count in counts)
+    # along the sweep: -1 where it goes down
+    sense = 1.0 if sweep.stop > sweep.start else -1.0
+    beyond, before = -math.inf, math.inf
+    good, bad = -math.inf, math.inf
+    for count in counts:
+        at = sense * count.level
+        shown_good, shown_bad = sweep.shown(count, confidence)
+        if shown_good:
+            beyond = max(beyond, at)
+        if shown_bad:
+            before = min(before, at)
+        if count.passed:
+            good = max(good, at)
+        else:
+            bad = min(bad, at)
+    ends = sorted((sense * beyond, sense * before))
+    method = f"bisection over {len(counts)} levels, Clopper-Pearson at each"
+    if not math.isfinite(good):
+        value = sweep.start
+        method += "; it does not even answer at the start"
+    elif not math.isfinite(bad):
+        value = sweep.stop
+        method += "; it still answers at the stop"
+    else:
+        value = sweep.between(sense * good, sense * bad)
+    return BoundedFigure(value, ends[0], ends[1], cases, method)
+
+
+def levels_text(counts: list[LevelCount]) -> Iterator[tuple[Any, ...]]:
+    """Rows of the levels in their order: level, successes, cases."""
+    for count in sorted(counts, key=lambda count: count.level):
+        yield count.level, count.successes, count.cases

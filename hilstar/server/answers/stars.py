@@ -1,0 +1,129 @@
+"""Single stars that a tracker reports, star by star against those that were lit.
+
+Reports are matched with all lit stars. Figures are of stars that stand alone, ALONE_PX from any
+brighter one and from the edges: a star that hides in another's light is no lack of the tracker.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import KDTree
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.rotation import to_matrix
+from hilstar.basics.units import magnitude
+from hilstar.optics.camera import Camera
+from hilstar.server.answers.answer import ReportedStar
+from hilstar.sky.stars import Stars
+
+BoolArray = npt.NDArray[np.bool_]
+
+MATCH_PX = 3.0  # a reported star farther from every lit one is a false star
+ALONE_PX = 8.0
+EDGE_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class LitStars:
+    """Stars (n,) that were lit within the detector: places, tracker pixels, V, B-V, and light in
+    electrons per second.
+    """
+
+    x_px: FloatArray
+    y_px: FloatArray
+    v_mag: FloatArray
+    bv: FloatArray
+    electrons_per_s: FloatArray
+
+    def some(self, chosen: IntArray) -> "LitStars":
+        """The chosen stars alone."""
+        parts = (self.x_px, self.y_px, self.v_mag, self.bv, self.electrons_per_s)
+        return LitStars(*(part[chosen] for part in parts))
+
+
+@dataclass(frozen=True, slots=True)
+class StarResiduals:
+    """Each lit star (n,) that stands alone against its report: reported minus lit place, px, and
+    signal in magnitudes minus that of its light; NaN where it was not reported.
+
+    The signal's zero point is any. `false` counts reported stars that were not lit.
+    """
+
+    lit: LitStars
+    dx_px: FloatArray
+    dy_px: FloatArray
+    signal_mag: FloatArray
+    false: int
+
+
+def judge_stars(
+    reported: tuple[ReportedStar, ...], lit: LitStars, size_px: tuple[int, int]
+) -> StarResiduals:
+    """Match reported stars with the lit ones within MATCH_PX, each with one at most, the brightest
+    lit star first; the detector is `size_px` (width, height).
+    """
+    order = np.argsort(-lit.electrons_per_s, kind="stable")
+    lit = lit.some(order)
+    dx_px, dy_px, signal_mag, false = _matched(reported, lit)
+    alone = np.flatnonzero(_stands_alone(lit, size_px))
+    return StarResiduals(lit.some(alone), dx_px[alone], dy_px[alone], signal_mag[alone], false)
+
+
+def lit_at(
+    q_icrs_to_cam: FloatArray, stars: Stars, camera: Camera, faintest_e_per_s: float
+) -> LitStars:
+    """The stars that a display shows a tracker's `camera` at an attitude, of a given light on."""
+    axes = to_matrix(q_icrs_to_cam)
+    near = stars.near(axes[2], camera.field_radius_rad(EDGE_PX))
+    near = near[stars.electrons_per_s[near] >= faintest_e_per_s]
+    rays = stars.directions(near) @ axes.T
+    x_px, y_px = camera.project(rays @ camera.cam_to_image.T)
+    width, height = camera.resolution_px
+    with np.errstate(invalid="ignore"):
+        inside = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (
+            np.abs(y_px - (height - 1) / 2) <= height / 2
+        )
+    seen = near[inside]
+    light = (stars.v_mag[seen], stars.bv_mag[seen], stars.electrons_per_s[seen])
+    return LitStars(x_px[inside], y_px[inside], *light)
+
+
+def _stands_alone(lit: LitStars, size_px: tuple[int, int]) -> BoolArray:
+    """Which stars (n,), the brightest first, have no brighter one and no edge near."""
+    alone = np.ones(len(lit.x_px), dtype=np.bool_)
+    for place_px, side in zip((lit.x_px, lit.y_px), size_px, strict=True):
+        alone &= (place_px >= ALONE_PX) & (place_px <= side - 1 - ALONE_PX)
+    if len(lit.x_px):
+        places = np.stack([lit.x_px, lit.y_px], axis=1)
+        pairs: Any = KDTree(places).query_pairs(ALONE_PX, output_type="ndarray")
+        alone[pairs.max(axis=1)] = False
+    return alone
+
+
+def _matched(
+    reported: tuple[ReportedStar, ...], lit: LitStars
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """Places off (n,), px, and signals (n,), mag, of lit stars, and how many reports are left."""
+    dx_px, dy_px, signal_mag = np.full((3, len(lit.x_px)), np.nan)
+    if not reported or not len(lit.x_px):
+        return dx_px, dy_px, signal_mag, len(reported)
+    x_px = np.array([star.x_px for star in reported])
+    y_px = np.array([star.y_px for star in reported])
+    dn = np.array([np.nan if star.dn is None else star.dn for star in reported])
+    places = KDTree(np.stack([x_px, y_px], axis=1))
+    near: Any = places.query_ball_point(np.stack([lit.x_px, lit.y_px], axis=1), MATCH_PX)
+    taken = np.zeros(len(reported), dtype=np.bool_)
+    for star, candidates in enumerate(near):
+        free = [k for k in candidates if not taken[k]]
+        if not free:
+            continue
+        off_px = np.hypot(x_px[free] - lit.x_px[star], y_px[free] - lit.y_px[star])
+        best = free[int(np.argmin(off_px))]
+        taken[best] = True
+        dx_px[star] = x_px[best] - lit.x_px[star]
+        dy_px[star] = y_px[best] - lit.y_px[star]
+        if dn[best] > 0:
+            signal_mag[star] = magnitude(dn[best] / lit.electrons_per_s[star])
+    return dx_px, dy_px, signal_mag, int((~taken).sum())

@@ -1,0 +1,112 @@
+"""hilstar accept: the command, its page, tables and exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.support.acceptance import write_bench
+from tests.support.commands import assert_refused, run_hilstar_here
+
+PLAN = """
+title = "Four clauses"
+[cases.lost]
+about = "All over the sky"
+cases = 24
+quick_cases = 6
+[cases.rate]
+cases = 8
+[cases.rate.sweep]
+key = "rate_deg_s.across"
+start = 0.1
+stop = 10.0
+scale = "log"
+rounds = 2
+unit = "deg/s"
+[planted]
+max_rate_deg_s = 1.0
+[[clause]]
+capability = "A right attitude"
+of = "lost"
+quantity = "availability"
+minimum = 0.5
+[[clause]]
+capability = "Time to it"
+of = "lost"
+quantity = "time-to-first-attitude"
+share = 0.5
+maximum = 1.0
+[[clause]]
+capability = "Largest <rate>"
+of = "rate"
+quantity = "edge"
+minimum = 5.0
+[[clause]]
+capability = "Recovery"
+of = "lost"
+quantity = "recovery"
+maximum = 1.0
+[[untested]]
+capability = "Vacuum"
+why = "not of a bench"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_bench(tmp_path)
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return tmp_path
+
+
+def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> None:
+    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--workers", "1")
+    done = run_hilstar_here(*words, "--strict", "--json", cwd=folder)
+    assert done.returncode == 1
+    told = json.loads(done.stdout)
+    verdicts = {clause["capability"]: clause["verdict"] for clause in told["clauses"]}
+    assert verdicts == {
+        "A right attitude": "met",
+        "Time to it": "met",
+        "Largest <rate>": "not met",
+        "Recovery": "not tested",
+    }
+    assert told["verdict"] == "not met" and told["cases"] == 24 + 8 * 4
+    page = (folder / "out" / "accept.html").read_text()
+    assert "Largest &lt;rate&gt;" in page and "A clause is not met" in page
+    assert "Vacuum" in page and "not of a bench" in page and "varies scenario" in page
+    with (folder / "out" / "ledger.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == told["cases"]
+    assert {row["level"] for row in rows if row["set"] == "rate"} >= {"0.1", "10.0"}
+    with (folder / "out" / "acceptance.csv").open() as file:
+        rates = [row for row in csv.DictReader(file) if row["quantity"] == "edge"]
+    assert float(rates[0]["low"]) <= 1.0 <= float(rates[0]["high"]) and rates[0]["unit"] == "deg/s"
+    # the same command judges what is there, and other limits
+    (folder / "plan.toml").write_text(PLAN.replace("minimum = 5.0", "minimum = 0.2"))
+    again = run_hilstar_here(*words, "--strict", cwd=folder)
+    assert again.returncode == 0 and "cases" not in again.stderr
+    assert "Vacuum" in again.stdout and "not tested" in again.stdout
+
+
+def test_a_dry_run_says_how_long_each_set_takes_and_writes_nothing(folder: Path) -> None:
+    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--quick", "--dry-run")
+    done = run_hilstar_here(*words, "--json", cwd=folder)
+    assert done.returncode == 0
+    told = json.loads(done.stdout)
+    assert [(row["set"], row["cases"]) for row in told["sets"]] == [("lost", 6), ("rate", 32)]
+    assert told["s"] == pytest.approx(sum(row["s"] for row in told["sets"])) and told["s"] > 0
+    assert told["sets"][0]["clauses"] == ["A right attitude", "Time to it", "Recovery"]
+    assert not (folder / "out").exists()
+
+
+def test_a_plan_that_is_not_there_and_an_option_of_another_way_are_refused(folder: Path) -> None:
+    words = ("accept", "bench.toml", "-o", "out", "--plan")
+    assert_refused(run_hilstar_here(*words, "no.toml", cwd=folder), 2, "no.toml", "ecss.toml")
+    refused = run_hilstar_here(*words, "plan.toml", "--headless", cwd=folder)
+    assert_refused(refused, 2, "--headless", "--through bench")
+    bench = run_hilstar_here(*words, "plan.toml", "--through", "bench", cwd=folder)
+    assert_refused(bench, 2, "needs the tracker's answers")

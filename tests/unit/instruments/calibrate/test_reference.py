@@ -1,0 +1,225 @@
+"""The alignment reference by a theodolite: planted rotations are found, within the stated
+uncertainty, whatever the stations; readings that tell none are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import (
+    conjugate,
+    from_matrix,
+    multiply,
+    normalise,
+    to_matrix,
+    to_rotation_vector,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.calibrate.reference import (
+    FACES,
+    fit_reference,
+    pointing,
+    read_readings,
+    toml_of,
+)
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import bench_camera
+from tests.support.benches import bench_text
+from tests.support.commands import assert_refused, run_hilstar_here
+
+NOISE_ARCSEC = 1.0
+BENCHES = 1000
+# binomial: of 1000 intervals at 95 % each, 928 and fewer hold once in 1000, and 970 and more
+MIN_HELD, MAX_HELD = 929, 970
+EXACT_ARCSEC = 1e-3
+DOTS = ((0.05, 0.02, 1.0), (-0.06, 0.03, 1.0), (0.01, -0.07, 1.0))
+
+
+def turned(rng: np.random.Generator, size: float = 1.0) -> FloatArray:
+    """A rotation matrix by chance; with a small `size` near the identity."""
+    q = normalise(np.array([1.0, *(size * rng.normal(size=3))]))
+    return to_matrix(q)
+
+
+def angles_deg(direction: FloatArray) -> tuple[float, float]:
+    azimuth = math.degrees(math.atan2(direction[1], direction[0]))
+    return azimuth, math.degrees(math.asin(-direction[2]))
+
+
+def planted(
+    rng: np.random.Generator,
+    noise_arcsec: float = NOISE_ARCSEC,
+    stations: bool = True,
+    repeats: int = 3,
+    sigma: bool = False,
+) -> tuple[str, FloatArray]:
+    """The readings of a display and a cube that stand by chance, and the rotation between them."""
+    # mon looks along the horizon, and the cube is levelled to some degrees
+    level = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    from_mon = turned(rng, 0.05) @ level
+    cube = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    from_cube = turned(rng, 0.05) @ cube
+    zero_deg = float(rng.uniform(-180, 180)) if stations else 0.0
+    rows = []
+
+    def add(target: str, direction: FloatArray, station: str, more: str = ",,") -> None:
+        for _ in range(repeats):
+            azimuth, elevation = angles_deg(direction)
+            azimuth -= zero_deg if station == "B" else 0.0
+            azimuth += rng.normal() * noise_arcsec / 3600 / math.cos(math.radians(elevation))
+            elevation += rng.normal() * noise_arcsec / 3600
+            stated = f"{noise_arcsec:g}" if sigma else ""
+            rows.append(f"{target},{azimuth:.9f},{elevation:.9f},{station},{stated},{more}")
+
+    for dot in DOTS:
+        add("dot", from_mon @ np.array(dot) / np.linalg.norm(dot), "A", ",".join(map(str, dot)))
+    second = "B" if stations else "A"
+    for face in ("+x", "-y"):
+        add(face, -from_cube @ FACES[face], second)
+    if stations:
+        for link in (pointing(0.3, 0.02), pointing(2.0, -0.1)):
+            name = f"link {link[0]:.1f}"
+            add(name, link, "A")
+            add(name, link, "B")
+    head = "target,azimuth_deg,elevation_deg,station,sigma_arcsec,mon_x,mon_y,mon_z"
+    return "\n".join([head, *rows]) + "\n", from_matrix(from_cube.T @ from_mon)
+
+
+def fitted(folder: Path, text: str) -> Any:
+    path = folder / "readings.csv"
+    path.write_text(text)
+    return fit_reference(path, read_readings(path, None))
+
+
+def off_arcsec(found: FloatArray, true: FloatArray) -> FloatArray:
+    """The error of a rotation about mon's axes (3,)."""
+    return np.asarray(ARCSEC_PER_RAD * to_rotation_vector(multiply(conjugate(true), found)))
+
+
+@pytest.mark.parametrize("stations", [False, True])
+def test_a_rotation_is_found_exactly_without_noise(
+    tmp_path: Path, stations: bool, rng: np.random.Generator
+) -> None:
+    text, true = planted(rng, 0.0, stations)
+    found = fitted(tmp_path, text)
+    assert np.abs(off_arcsec(found.q_mon_to_reference, true)).max() < EXACT_ARCSEC
+
+
+@pytest.mark.parametrize("sigma", [False, True])
+def test_the_intervals_of_1000_benches_hold(
+    tmp_path: Path, sigma: bool, rng: np.random.Generator
+) -> None:
+    from scipy import stats
+
+    held = np.zeros(3)
+    small = []
+    for _ in range(BENCHES):
+        text, true = planted(rng, stations=True, sigma=sigma)
+        found = fitted(tmp_path, text)
+        k = 1.96 if found.dof is None else float(stats.t.ppf(0.975, found.dof))
+        off = np.abs(off_arcsec(found.q_mon_to_reference, true))
+        held += off <= k * np.array(found.sigma_arcsec)
+        small.append(max(found.sigma_arcsec[:2]))
+    assert (held >= MIN_HELD).all() and (held <= MAX_HELD).all()
+    # the aim of 1 arcsec: three readings of 1 arcsec of each target know the boresight to it
+    assert np.median(small) < 1.0
+
+
+def test_scatter_that_contradicts_the_stated_sigmas_counts(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    text, _ = planted(rng, 10.0, sigma=True)
+    found = fitted(tmp_path, text.replace(",10,", ",1,"))
+    assert found.dof is not None and max(found.sigma_arcsec) > 3.0
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda rows: [row for row in rows if not row.startswith("dot")], "readings of dots"),
+        (lambda rows: [row for row in rows if not row.startswith("-y")], "faces of the cube"),
+        (lambda rows: [row for row in rows if not row.startswith("link")], "shares no link"),
+        (lambda rows: [rows[0], "+q,1,2,A,,,,", *rows[1:]], "write a face"),
+        (lambda rows: [rows[0], "+x,1,95,A,,,,", *rows[1:]], "above the horizon"),
+        (lambda rows: [rows[0], "dot,1,2,A,,,,", *rows[1:]], "without a place"),
+        (lambda rows: [rows[0], "dot,1,2,A,-1,0,0,1", *rows[1:]], "arcsec above 0"),
+        (lambda rows: [rows[0], "dot,one,2,A,,0,0,1", *rows[1:]], "no finite number|not a finite"),
+    ],
+)
+def test_readings_that_tell_no_rotation_are_refused(
+    tmp_path: Path, change: Any, told: str, rng: np.random.Generator
+) -> None:
+    rows = planted(rng)[0].splitlines()
+    with pytest.raises(InputError, match=told):
+        fitted(tmp_path, "\n".join(change(rows)) + "\n")
+
+
+def test_a_dot_by_its_pixel_is_where_the_bench_shows_it(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text())
+    file = read_bench_file(bench)
+    camera = bench_camera(file.config, file.folder)
+    path = tmp_path / "readings.csv"
+    path.write_text("target,azimuth_deg,elevation_deg,x_px,y_px\ndot,0,0,200,300\n")
+    (reading,) = read_readings(path, camera)
+    ray = camera.rays(np.array([200.0]), np.array([300.0]))[0]
+    assert reading.direction is not None
+    assert reading.direction == pytest.approx(ray / np.linalg.norm(ray))
+    with pytest.raises(InputError, match="--bench"):
+        read_readings(path, None)
+
+
+def test_the_command_prints_a_table_that_a_bench_file_takes(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    text, true = planted(rng)
+    (tmp_path / "readings.csv").write_text(text)
+    words = ("calibrate", "reference", "readings.csv", "-o", "alignment.toml", "--name", "cube 7")
+    done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 0 and "one sigma" in done.stdout
+    table = (tmp_path / "alignment.toml").read_text()
+    assert table in done.stdout
+    before = tmp_path / "bench.toml"
+    before.write_text(bench_text())
+    after = tmp_path / "with.toml"
+    after.write_text(f"{bench_text()}\n{table}")
+    file = read_bench_file(after)
+    assert file.config.alignment is not None and file.config.alignment.name == "cube 7"
+    off = off_arcsec(np.array(file.config.alignment.q_mon_to_reference), true)
+    assert np.abs(off).max() < 5 * max(fitted(tmp_path, text).sigma_arcsec)
+    # what is said of a bench changes no frame
+    assert file.sha256 == read_bench_file(before).sha256
+    assert_refused(run_hilstar_here(*words[:3], "-o", "a.csv", cwd=tmp_path), 2, ".toml")
+
+
+def test_a_bench_file_with_a_wrong_table_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    for table, told in (
+        ("q_mon_to_reference = [1.0, 0.0, 0.0, 1.0]", "norm is 1.41421"),
+        (
+            "q_mon_to_reference = [1.0, 0.0, 0.0, 0.0]\n"
+            "covariance_arcsec2 = [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]",
+            "no covariance",
+        ),
+    ):
+        path.write_text(f"{bench_text()}\n[alignment]\n{table}\n")
+        with pytest.raises(InputError, match=told):
+            read_bench_file(path)
+
+
+def test_the_table_keeps_what_was_found(tmp_path: Path, rng: np.random.Generator) -> None:
+    found = fitted(tmp_path, planted(rng)[0])
+    path = tmp_path / "bench.toml"
+    path.write_text(f"{bench_text()}\n{toml_of(found, '', '2026-01-01')}")
+    settings = read_bench_file(path).config.alignment
+    assert settings is not None and settings.dof == found.dof
+    assert np.array(settings.covariance_arcsec2) == pytest.approx(found.covariance_arcsec2)

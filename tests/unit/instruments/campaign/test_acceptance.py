@@ -1,0 +1,240 @@
+"""An acceptance: each planted fault of the virtual tracker is found by its clause, a healthy one is
+not accused, and plans that are wrong are refused.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hilstar.basics.errors import InputError
+from hilstar.instruments.campaign.acceptance_plan import CaseSet, plan_path, read_acceptance_plan
+from hilstar.instruments.campaign.plan import PlantedFaults
+from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
+from tests.support.acceptance import accepted, write_bench
+from tests.support.benches import ROOT
+
+# found within 10 %, or within three standard errors where those are larger
+SHARE, SIGMAS = 0.1, 3.0
+ONE_SIDED = 1.645  # sigmas from a figure to its one-sided limit at 95 %
+
+FIELD = """
+[cases.field.attitudes]
+kind = "field"
+radec_deg = [84.0, 0.0]
+radius_deg = 1.0
+roll_deg = [0.0, 0.0]
+"""
+SLEWS = "".join(
+    f'[[cases.slews.vary]]\nkey = "{key}.{axis}"\nminimum = {-size}\nmaximum = {size}\n'
+    for key, size in (("rate_deg_s", 0.5), ("acceleration_deg_s2", 0.1))
+    for axis in "xyz"
+)
+VELOCITIES = "".join(
+    f'[[cases.aberration.vary]]\nkey = "sky.observer_velocity_km_s.{k}"\n'
+    "minimum = -30.0\nmaximum = 30.0\n"
+    for k in range(3)
+)
+SCENARIO = '[[fault]]\nname = "dark"\nkind = "blank"\nat_s = 0.5\nfor_s = 0.5\n'
+SETS = {
+    "lost": "[cases.lost]\ncases = 60\nframes = 4\n",
+    "field": f"[cases.field]\ncases = 60\nframes = 3\n{FIELD}",
+    "slews": f"[cases.slews]\ncases = 40\nframes = 5\n{SLEWS}",
+    "aberration": f"[cases.aberration]\ncases = 30\n{VELOCITIES}",
+    "stars": "[cases.stars]\ncases = 40\nframes = 2\n",
+    "recovery": (
+        "[cases.recovery]\ncases = 60\nframes = 20\nstep_s = 0.1\n[[cases.recovery.vary]]\n"
+        'key = "scenario"\nvalues = ["dark.toml"]\n'
+    ),
+    "rate-limit": (
+        "[cases.rate-limit]\ncases = 16\n[cases.rate-limit.sweep]\n"
+        'key = "rate_deg_s.across"\nstart = 0.1\nstop = 10.0\nscale = "log"\nrounds = 7\n'
+    ),
+    "false-stars": (
+        "[cases.false-stars]\ncases = 16\n[cases.false-stars.sweep]\n"
+        'key = "tracker.detector.false_stars"\nstart = 1\nstop = 200\nscale = "log"\nwhole = true\n'
+    ),
+}
+# quantity (and axis, or the sweep): its cases, what is planted, its size, and the limit's side
+FAULTS: dict[str, tuple[str, str, float, str]] = {
+    "bias x": ("field", "bias_arcsec = [40.0, 0.0, 0.0]", 40.0, "maximum"),
+    "bias roll": ("field", "bias_arcsec = [0.0, 0.0, 300.0]", 300.0, "maximum"),
+    "nea cross": ("field", "noise_arcsec = [20.0, 20.0, 0.0]", 20.0, "maximum"),
+    "nea roll": ("field", "noise_arcsec = [0.0, 0.0, 100.0]", 100.0, "maximum"),
+    "availability": ("lost", "missing = 0.3", 0.7, "minimum"),
+    "no-attitude": ("lost", "missing = 0.3", 0.3, "maximum"),
+    "false-attitude": ("lost", "wrong = 0.3", 0.3, "maximum"),
+    "wrong-rate": ("lost", "wrong = 0.3", 0.3, "maximum"),
+    "time-to-first-attitude": ("lost", "acquisition_s = 0.5", 0.7, "maximum"),
+    "recovery": ("recovery", "recovery_s = 0.5", 0.6, "maximum"),
+    "rate-bias x": ("slews", "rate_bias_deg_s = [0.02, 0.0, 0.0]", 0.02, "maximum"),
+    "rate-bias roll": ("slews", "rate_bias_deg_s = [0.0, 0.0, 0.1]", 0.1, "maximum"),
+    "rate-noise cross": ("slews", "rate_noise_deg_s = [0.05, 0.05, 0.05]", 0.05, "maximum"),
+    "rate-scale cross": ("slews", "rate_scale = 0.05", 0.05, "maximum"),
+    "rate-lag cross": ("slews", "rate_lag_s = 0.4", 0.5, "maximum"),
+    "time-bias": ("slews", "stamp_bias_s = 0.02", 0.02, "maximum"),
+    "time-jitter": ("slews", "stamp_jitter_s = 0.02", 0.02, "maximum"),
+    "aberration": ("aberration", "aberration = 1.0", 1.0, "maximum"),
+    "star-noise": ("stars", "star_noise_px = 0.3", 0.3, "maximum"),
+    "star-fov-error": ("stars", "star_fov_px = 0.3", 0.3, "maximum"),
+    "star-colour": ("stars", "star_colour = 0.1", 0.1, "maximum"),
+    "star-limit": ("stars", "star_limit_v_mag = 5.0", 5.0, "minimum"),
+    "false-stars": ("stars", "false_stars = 2.0", 2.0, "maximum"),
+    "rate-limit": ("rate-limit", "max_rate_deg_s = 2.0", 2.0, "minimum"),
+    "false-stars edge": ("false-stars", "max_false_stars = 40", 40.0, "minimum"),
+}
+# A lag of 0.4 s is on top of the half step, 0.1 s, that a rate of two attitudes has; an attitude
+# comes with the first exposure (0.1 s) whose middle is over the planted time, of frames 0.2 s or
+# 0.1 s apart.
+
+
+def clause_text(key: str, limit: float, of: str, side: str) -> str:
+    quantity, _, axis = key.partition(" ")
+    lines = [f'[[clause]]\ncapability = "{key}"\nof = "{of}"\n{side} = {limit}']
+    if of == "rate-limit" or axis == "edge":
+        lines.append('quantity = "edge"')
+    else:
+        lines.append(f'quantity = "{quantity}"')
+        lines += [f'axis = "{axis}"'] if axis else []
+    return "\n".join(lines) + "\n"
+
+
+def plan_of(key: str, factor: float, planted: str = "") -> str:
+    """A plan of one clause, whose limit is `factor` times what is planted for it."""
+    of, _, size, side = FAULTS[key]
+    limit = size * factor
+    if key == "availability":
+        limit = min(limit, 0.95)
+    table = f"[planted]\n{planted}\n" if planted else ""
+    return f"{table}{SETS[of]}{clause_text(key, limit, of, side)}"
+
+
+@pytest.mark.parametrize("key", FAULTS)
+def test_a_planted_fault_is_found_by_its_clause(tmp_path: Path, key: str) -> None:
+    (tmp_path / "dark.toml").write_text(SCENARIO)
+    _, planted, size, side = FAULTS[key]
+    factor = 1.4 if side == "minimum" else 0.6
+    (found,) = accepted(tmp_path, plan_of(key, factor, planted)).values()
+    verdict = found.verdict
+    assert verdict is not None, found.untested
+    assert verdict.value is not None
+    ends = [end for end in (verdict.low, verdict.high) if end is not None]
+    sigma = (max(ends) - min(ends)) / (len(ends) * ONE_SIDED) if len(ends) == 2 else 0.0
+    assert abs(verdict.value - size) <= max(SHARE * size, SIGMAS * sigma)
+    assert found.word == NOT_MET
+    assert verdict.margin is not None and verdict.margin < 0
+
+
+@pytest.mark.parametrize("of", SETS)
+def test_a_healthy_tracker_is_not_accused(tmp_path: Path, of: str) -> None:
+    (tmp_path / "dark.toml").write_text(SCENARIO)
+    keys = [key for key, fault in FAULTS.items() if fault[0] == of]
+    text = SETS[of]
+    for key in keys:
+        _, _, size, side = FAULTS[key]
+        text += clause_text(key, size * (0.6 if side == "minimum" else 1.0), of, side)
+    words = {key: found.word for key, found in accepted(tmp_path, text).items()}
+    assert set(words.values()) <= {MET, NOT_SHOWN}
+    assert MET in words.values()
+
+
+# ---- the plan ----
+
+
+def read(folder: Path, text: str, through: str | None = None) -> list[CaseSet]:
+    path = folder / "plan.toml"
+    path.write_text(text)
+    bench = write_bench(folder)
+    return list(read_acceptance_plan(path, bench, False, through).sets)  # type: ignore[arg-type]
+
+
+ONE = SETS["lost"] + clause_text("availability", 0.9, "lost", "minimum")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (ONE.replace('of = "lost"', 'of = "los"'), "did you mean lost"),
+        (ONE.replace("minimum", "least"), "unknown key least"),
+        (ONE.replace("[cases.lost]", '[cases."Lost case"]'), "small letters"),
+        (ONE.replace("frames = 4", 'through = "tracker"'), "leave it out"),
+        (ONE.replace("frames = 4", "quick_cases = 0"), "quick_cases"),
+        (ONE + "share = 0.5\n", "leave share out"),
+        (ONE.replace('"availability"', '"edge"'), "has no sweep"),
+        (SETS["rate-limit"] + clause_text("nea", 1.0, "rate-limit", "maximum").replace(
+            '"edge"', '"nea"'), "quantity is edge"),
+        (SETS["rate-limit"].replace("start = 0.1", "start = 10.0")
+         + clause_text("rate-limit", 1.0, "rate-limit", "minimum"), "start and stop"),
+        (SETS["rate-limit"].replace("start = 0.1", "start = -0.1")
+         + clause_text("rate-limit", 1.0, "rate-limit", "minimum"), "above 0"),
+        (f"[planted]\nwronk = 0.1\n{ONE}", "did you mean wrong"),
+    ],
+)  # fmt: skip
+def test_a_wrong_plan_is_refused_in_one_line(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(InputError) as refused:
+        read(tmp_path, text)
+    line = str(refused.value)
+    assert "\n" not in line and "plan.toml" in line and told in line
+
+
+def test_a_condition_on_no_column_is_refused_before_the_first_case(tmp_path: Path) -> None:
+    text = ONE + 'condition = "rate_deg_s.x < 1"\n'
+    with pytest.raises(InputError, match="no key that the plan varies"):
+        accepted(tmp_path, text)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_display_cannot_change_is_not_tested_on_a_bench(tmp_path: Path) -> None:
+    edge = clause_text("false-stars edge", 10.0, "false-stars", "minimum")
+    lost, false_stars = read(
+        tmp_path, SETS["lost"] + SETS["false-stars"] + edge + ONE[len(SETS["lost"]) :], "bench"
+    )
+    assert not lost.refused and lost.tables["answers"] == 4 and "frames" not in lost.tables
+    assert "tracker.detector.false_stars" in false_stars.refused
+
+
+def test_the_plan_that_ships_has_a_comment_and_quick_cases_for_every_clause(tmp_path: Path) -> None:
+    path = plan_path(Path("ecss.toml"))
+    assert path == ROOT / "configs" / "plans" / "ecss.toml"
+    whole, quick = (
+        read_acceptance_plan(path, write_bench(tmp_path), is_quick, None)
+        for is_quick in (False, True)
+    )
+    for whole_set, quick_set in zip(whole.sets, quick.sets, strict=True):
+        assert quick_set.tables["cases"] < whole_set.tables["cases"]
+        assert whole_set.about and whole.clauses_of(whole_set.name)
+    quantities = {clause.quantity for clause in whole.clauses}
+    assert {"rate-bias", "time-bias", "star-noise", "edge", "aberration", "recovery"} <= quantities
+    assert whole.untested
+
+
+def test_every_planted_key_has_a_clause_that_finds_it() -> None:
+    planted = " ".join(fault[1] for fault in FAULTS.values())
+    missing = [name for name in PlantedFaults.__struct_fields__ if name not in planted]
+    assert missing == ["lost_roll"]  # found below
+
+
+def test_a_lost_roll_is_no_attitude_of_the_sky(tmp_path: Path) -> None:
+    text = SETS["lost"] + clause_text("false-attitude", 0.1, "lost", "maximum")
+    (found,) = accepted(tmp_path, f"[planted]\nlost_roll = true\n{text}").values()
+    assert found.word == NOT_MET and found.verdict is not None
+    # any roll is within 1800 arcsec of the true one in 2 x 0.5 of 360 degrees
+    assert found.verdict.value == pytest.approx(1 - 1 / 360, abs=0.02)
+
+
+def test_an_acceptance_goes_on_where_it_was_and_is_judged_again(tmp_path: Path) -> None:
+    text = SETS["lost"] + clause_text("availability", 0.9, "lost", "minimum")
+    accepted(tmp_path, text)
+    table = tmp_path / "out" / "lost" / "cases.parquet"
+    made_ns = table.stat().st_mtime_ns
+    more = SETS["aberration"] + clause_text("aberration", 0.5, "aberration", "maximum")
+    found = accepted(tmp_path, text.replace("minimum = 0.9", "maximum = 0.5") + more)
+    assert table.stat().st_mtime_ns == made_ns
+    assert found["availability"].word == NOT_MET and found["aberration"].word == MET
+
+
+def test_a_plan_with_other_cases_does_not_go_on(tmp_path: Path) -> None:
+    accepted(tmp_path, ONE)
+    with pytest.raises(InputError, match="the plan's cases was 60 and is 61"):
+        accepted(tmp_path, ONE.replace("cases = 60", "cases = 61"))

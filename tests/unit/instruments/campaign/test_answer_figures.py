@@ -1,0 +1,175 @@
+"""What answers carry beside the attitude: planted errors of rates, stamps, aberration and stars are
+found, and intervals hold at their stated confidence.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.cases import (
+    FRAME_ERRORS,
+    FRAME_RATE_ERRORS,
+    FRAME_RATES,
+    STAR_LISTS,
+)
+from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.planted import aberration_rad
+from hilstar.instruments.campaign.requirements import (
+    MET,
+    NOT_MET,
+    NOT_SHOWN,
+    RequirementVerdict,
+    verdicts_of,
+)
+from hilstar.instruments.campaign.results import Columns
+
+SCALE = Scale(1500.0, (512, 512))
+CASES, FRAMES = 60, 8
+RATE_NOISE_DEG_S = 0.01
+NOISE_ARCSEC = 2.0
+# found within 10 %, or within three standard errors where those are larger
+SHARE, SIGMAS = 0.1, 3.0
+COVERED, TRIES = 0.95, 200
+# binomial: of 200 intervals at 95 % each way, 180 and fewer hold once in 1000
+MIN_HELD = 180
+
+
+def answers(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Columns:
+    """The answers of slews whose errors are planted: rates in deg/s, stamps in s, shares."""
+    rate = rng.uniform(-0.5, 0.5, (cases, 3))
+    acceleration = rng.uniform(-0.1, 0.1, (cases, 3))
+    bias = np.array(planted.get("rate_bias", (0.0, 0.0, 0.0)))
+    numbers: dict[str, Any] = {"case": np.arange(cases, dtype=float)}
+    numbers["frames"] = np.full(cases, float(FRAMES))
+    velocity = rng.uniform(-30, 30, (cases, 3))
+    q = np.array([from_radec_roll_deg(*rng.uniform(-80, 80, 3).tolist()) for _ in range(cases)])
+    off = np.zeros((cases, 3))
+    for k in range(cases):
+        off[k] = planted.get("aberration", 0.0) * aberration_rad(q[k], velocity[k])
+    error = np.degrees(off) * 3600 + NOISE_ARCSEC * rng.standard_normal((cases, 3))
+    for k, axis in enumerate("xyz"):
+        numbers[f"vary.acceleration_deg_s2.{axis}"] = acceleration[:, k]
+        numbers[f"vary.sky.observer_velocity_km_s.{k}"] = velocity[:, k]
+        numbers[f"error_{axis}_arcsec"] = error[:, k]
+    for k, name in enumerate(("qw", "qx", "qy", "qz")):
+        numbers[name] = q[:, k]
+    lists: dict[str, list[Any]] = {}
+    steps = 0.2 * np.arange(FRAMES)
+    noise = planted.get("rate_noise", RATE_NOISE_DEG_S)
+    delay = planted.get("stamp_bias", 0.0)
+    delay = delay + planted.get("stamp_jitter", 0.0) * rng.standard_normal((cases, FRAMES))
+    for k in range(3):
+        true = rate[:, k, None] + acceleration[:, k, None] * steps
+        told = bias[k] + planted.get("rate_scale", 0.0) * true
+        told = told - planted.get("rate_lag", 0.0) * acceleration[:, k, None]
+        told = told + noise * rng.standard_normal((cases, FRAMES))
+        of_stamp = 3600 * true * delay + 5.0 * (k + 1)
+        of_stamp = of_stamp + NOISE_ARCSEC * rng.standard_normal((cases, FRAMES))
+        lists[FRAME_RATES[k]] = list(true)
+        lists[FRAME_RATE_ERRORS[k]] = list(told)
+        lists[FRAME_ERRORS[k]] = list(of_stamp)
+    return Columns(cases, numbers, {}, lists)
+
+
+def stars(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Columns:
+    """Reported stars with planted errors: px, magnitudes, and false stars a frame."""
+    lists: dict[str, list[Any]] = {name: [] for name in STAR_LISTS}
+    false = rng.poisson(planted.get("false", 0.2), cases)
+    for _ in range(cases):
+        n = 30
+        x, y = rng.uniform(8, 503, (2, n))
+        v_mag = rng.uniform(2, 7, n)
+        bv = rng.uniform(-0.2, 1.8, n)
+        wave = math.sqrt(2) * planted.get("fov", 0.0) * np.sin(2 * np.pi * x / 512)
+        dx = wave + planted.get("noise", 0.1) * rng.standard_normal(n)
+        dy = wave + planted.get("noise", 0.1) * rng.standard_normal(n)
+        signal = 3.0 + planted.get("colour", 0.0) * bv + 0.02 * rng.standard_normal(n)
+        seen = rng.random(n) < 1 / (1 + np.exp((v_mag - planted.get("limit", 5.5)) / 0.1))
+        for column in (dx, dy, signal):
+            column[~seen] = np.nan
+        for name, column in zip(STAR_LISTS, (x, y, v_mag, bv, dx, dy, signal), strict=True):
+            lists[name].append(column)
+    numbers = {
+        "case": np.arange(cases, dtype=float),
+        "frames": np.ones(cases),
+        "star_frames": np.ones(cases),
+        "star_false": false.astype(float),
+    }
+    return Columns(cases, numbers, {}, lists)
+
+
+def verdict(cases: Columns, quantity: str, **keys: Any) -> RequirementVerdict:
+    return verdicts_of([Require(quantity=quantity, **keys)], cases, SCALE, 1)[0]  # type: ignore[arg-type]
+
+
+# quantity: the planted keys by size, the size, and how its cases are made
+PLANTED: dict[str, tuple[Any, Any, float]] = {
+    "rate-bias": (answers, lambda size: {"rate_bias": (size, 0.0, 0.0)}, 0.02),
+    "rate-noise": (answers, lambda size: {"rate_noise": size}, 0.05),
+    "rate-scale": (answers, lambda size: {"rate_scale": size}, 0.05),
+    "rate-lag": (answers, lambda size: {"rate_lag": size}, 0.3),
+    "time-bias": (answers, lambda size: {"stamp_bias": size}, 0.02),
+    "time-jitter": (answers, lambda size: {"stamp_jitter": size}, 0.02),
+    "aberration": (answers, lambda size: {"aberration": size}, 1.0),
+    "star-noise": (stars, lambda size: {"noise": size}, 0.3),
+    "star-fov-error": (stars, lambda size: {"fov": size}, 0.3),
+    "star-colour": (stars, lambda size: {"colour": size}, 0.1),
+    "star-limit": (stars, lambda size: {"limit": size}, 5.0),
+    "false-stars": (stars, lambda size: {"false": size}, 2.0),
+}
+
+
+@pytest.mark.parametrize("quantity", PLANTED)
+def test_a_planted_error_is_found_and_judged(quantity: str, rng: np.random.Generator) -> None:
+    make, keys, size = PLANTED[quantity]
+    cases = make(rng, **keys(size))
+    side = "minimum" if quantity == "star-limit" else "maximum"
+    broken = size * (1.5 if side == "minimum" else 0.5)
+    found = verdict(cases, quantity, **{side: broken})
+    assert found.value is not None and found.low is not None and found.high is not None
+    # one sigma by the one-sided limits at 95 %
+    sigma = (found.high - found.low) / (2 * 1.645)
+    assert abs(found.value - size) <= max(SHARE * size, SIGMAS * sigma)
+    assert found.low < size * (1 + SHARE) and found.high > size * (1 - SHARE)
+    assert found.verdict == NOT_MET and found.margin is not None and found.margin < 0
+    kept = size * (0.5 if side == "minimum" else 1.5)
+    assert verdict(cases, quantity, **{side: kept}).verdict == MET
+
+
+@pytest.mark.parametrize("quantity", ["rate-bias", "rate-scale", "time-bias", "aberration"])
+def test_limits_hold_at_their_confidence(quantity: str, rng: np.random.Generator) -> None:
+    make, keys, size = PLANTED[quantity]
+    above = below = 0
+    for _ in range(TRIES):
+        found = verdict(make(rng, 40, **keys(size)), quantity, maximum=size, axis=_axis(quantity))
+        assert found.low is not None and found.high is not None
+        above += found.high >= size
+        below += found.low <= size
+    assert above >= MIN_HELD and below >= MIN_HELD
+
+
+def _axis(quantity: str) -> str | None:
+    return "x" if quantity.startswith("rate-") else None
+
+
+def test_slews_of_one_sign_do_not_tell_a_stamp_from_a_bias(rng: np.random.Generator) -> None:
+    cases = answers(rng)
+    for name in FRAME_RATES:
+        cases.lists[name] = [np.abs(values) for values in cases.lists[name]]
+    found = verdict(cases, "time-bias", maximum=0.01)
+    assert found.verdict == NOT_SHOWN and "both signs" in found.method
+
+
+def test_answers_without_rates_or_stars_say_so(rng: np.random.Generator) -> None:
+    cases = answers(rng)
+    for name in FRAME_RATE_ERRORS:
+        cases.lists[name] = [np.full(FRAMES, np.nan)] * CASES
+    found = verdict(cases, "rate-bias", maximum=0.01)
+    assert found.value is None and found.more is None and "no rate" in found.method
+    assert "no single stars" in verdict(answers(rng), "star-noise", maximum=0.1).method

@@ -1,0 +1,77 @@
+"""A sweep with an edge: levels by bisection, and an interval that holds whatever the curve."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.campaign.sweep import LevelCount, SweepTable, edge_figure, next_level
+
+CASES = 16
+TRIES = 300
+# binomial: of 300 intervals at 95 % each way, 272 and fewer hold once in 1000
+MIN_HELD = 273
+
+
+def swept(
+    sweep: SweepTable, edge: float, width: float, rng: np.random.Generator
+) -> list[LevelCount]:
+    """The levels of a tracker whose share of answers falls by a logistic curve of log level."""
+    counts: list[LevelCount] = []
+    sense = 1 if sweep.stop > sweep.start else -1
+    while (level := next_level(sweep, counts)) is not None:
+        off = sense * math.log(level / edge) / width
+        share = 1 / (1 + math.exp(min(off, 700.0)))
+        counts.append(LevelCount(level, int(rng.binomial(CASES, share)), CASES))
+    return counts
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0.1, 10.0), (10.0, 0.1)])
+def test_a_sharp_edge_is_bracketed_as_closely_as_the_rounds_allow(
+    start: float, stop: float, rng: np.random.Generator
+) -> None:
+    sweep = SweepTable(key="k", start=start, stop=stop, scale="log", rounds=7)
+    counts = swept(sweep, 2.0, 1e-6, rng)
+    assert len(counts) == sweep.levels
+    found = edge_figure(sweep, counts, 0.95)
+    # a hundredfold range, halved seven times on its logarithm: 100^(1/128)
+    assert found.low < 2.0 < found.high and found.high / found.low == pytest.approx(1.037, abs=1e-3)
+    assert found.low <= found.value <= found.high
+
+
+@pytest.mark.parametrize("width", [0.02, 0.1, 0.5])
+def test_limits_hold_at_their_confidence(width: float, rng: np.random.Generator) -> None:
+    sweep = SweepTable(key="k", start=0.1, stop=10.0, scale="log", rounds=7)
+    held = np.zeros(2)
+    for _ in range(TRIES):
+        found = edge_figure(sweep, swept(sweep, 1.5, width, rng), 0.95)
+        held += found.low <= 1.5, found.high >= 1.5
+    assert (held >= MIN_HELD).all()
+
+
+def test_an_edge_that_is_not_reached_has_an_open_end(rng: np.random.Generator) -> None:
+    sweep = SweepTable(key="k", start=1.0, stop=10.0, rounds=4)
+    beyond = edge_figure(sweep, swept(sweep, 1e6, 0.01, rng), 0.95)
+    assert beyond.low == 10.0 and beyond.high == math.inf and "at the stop" in beyond.method
+    before = edge_figure(sweep, swept(sweep, 1e-6, 0.01, rng), 0.95)
+    assert before.high == 1.0 and before.low == -math.inf and "at the start" in before.method
+
+
+def test_where_it_still_answers_at_the_stop_levels_before_it_show_how_far() -> None:
+    sweep = SweepTable(key="k", start=1.0, stop=9.0, rounds=3)
+    counts = [LevelCount(1.0, 16, 16), LevelCount(9.0, 10, 16)]
+    assert next_level(sweep, counts) == 5.0
+    counts.append(LevelCount(5.0, 16, 16))
+    assert next_level(sweep, counts) == 7.0
+    assert edge_figure(sweep, counts, 0.95).low == 5.0
+
+
+def test_a_whole_key_takes_whole_numbers_and_ends_between_two(rng: np.random.Generator) -> None:
+    sweep = SweepTable(key="k", start=1, stop=9, whole=True, rounds=12)
+    counts = swept(sweep, 6.5, 1e-6, rng)
+    assert all(count.level == int(count.level) for count in counts)
+    assert len(counts) < sweep.levels
+    found = edge_figure(sweep, counts, 0.95)
+    assert (found.low, found.high) == (6.0, 7.0)

@@ -1,0 +1,92 @@
+"""From cube to boresight: where it points, and that its 95 % holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_matrix,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.server.bench.alignment import Turned, cube_to_boresight, radius_of_95
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from tests.support.benches import bench_text
+
+COVARIANCE = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 9.0]])
+Q_CAM_TO_MON = normalise(np.array([1.0, 0.01, -0.02, 0.03]))
+Q_MON_TO_REFERENCE = normalise(np.array([0.5, 0.5, -0.5, 0.5]) + 0.01)
+BENCHES = 4000
+# binomial: of 4000 with 95 % each, between these in 998 of 1000
+MIN_HELD, MAX_HELD = 3757, 3841
+
+
+def bench(folder: Path, *, covariance: bool = True) -> BenchFile:
+    path = folder / "bench.toml"
+    lines = ["[alignment]", f"q_mon_to_reference = {Q_MON_TO_REFERENCE.tolist()}"]
+    if covariance:
+        lines.append(f"covariance_arcsec2 = {COVARIANCE.tolist()}")
+    text = bench_text({"collimator": {"q_cam_to_mon": Q_CAM_TO_MON.tolist()}})
+    path.write_text(text + "\n" + "\n".join(lines) + "\n")
+    return read_bench_file(path)
+
+
+def test_the_boresight_is_cam_z_in_the_reference(tmp_path: Path) -> None:
+    found = cube_to_boresight(bench(tmp_path), None)
+    assert found is not None
+    z = to_matrix(Q_MON_TO_REFERENCE) @ to_matrix(Q_CAM_TO_MON) @ np.array([0.0, 0.0, 1.0])
+    assert np.array(found.boresight) == pytest.approx(z, abs=1e-12)
+    assert "certificate" in found.without[0] and "95 %" in found.line
+
+
+def test_a_tracker_s_bias_turns_its_boresight_where_it_stands(tmp_path: Path) -> None:
+    """A tracker that truly stands at q_cam_to_mon Q' reports a bias M = Q'* Q."""
+    truly = multiply(Q_CAM_TO_MON, from_rotation_vector(np.array([1e-4, -2e-4, 3e-4])))
+    bias = multiply(conjugate(truly), Q_CAM_TO_MON)
+    bias_arcsec = 2 * ARCSEC_PER_RAD * bias[1:]
+    turned = Turned(bias_arcsec, np.zeros(3))
+    found = cube_to_boresight(bench(tmp_path), None, turned)
+    assert found is not None
+    z = to_matrix(Q_MON_TO_REFERENCE) @ to_matrix(truly) @ np.array([0.0, 0.0, 1.0])
+    assert np.array(found.boresight) == pytest.approx(z, abs=1e-9)
+
+
+def test_the_radius_and_the_roll_hold_95_percent(tmp_path: Path, rng: np.random.Generator) -> None:
+    found = cube_to_boresight(bench(tmp_path), None)
+    assert found is not None and found.cross_arcsec is not None and found.roll_arcsec is not None
+    errors = rng.multivariate_normal(np.zeros(3), COVARIANCE, BENCHES) / ARCSEC_PER_RAD
+    across = about = 0
+    for error in errors:
+        q = multiply(Q_MON_TO_REFERENCE, from_rotation_vector(error))
+        z = to_matrix(q) @ to_matrix(Q_CAM_TO_MON)[:, 2]
+        off = np.linalg.norm(np.cross(z, found.boresight)) * ARCSEC_PER_RAD
+        across += off <= found.cross_arcsec
+        turn = to_matrix(Q_CAM_TO_MON).T @ error
+        about += abs(turn[2]) * ARCSEC_PER_RAD <= found.roll_arcsec
+    assert MIN_HELD <= across <= MAX_HELD and MIN_HELD <= about <= MAX_HELD
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "radius"),
+    [((1.0, 1.0), 2.44775), ((1.0, 0.0), 1.95996), ((0.0, 0.0), 0.0)],
+)
+def test_the_radius_of_a_circle_and_of_a_line(sigmas: tuple[float, float], radius: float) -> None:
+    """sqrt of chi-square of two degrees of freedom, and of one, at 95 %."""
+    assert radius_of_95(np.diag(np.square(sigmas))) == pytest.approx(radius, abs=1e-4)
+
+
+def test_without_a_covariance_the_uncertainty_is_not_known(tmp_path: Path) -> None:
+    found = cube_to_boresight(bench(tmp_path, covariance=False), None)
+    assert found is not None and found.cross_arcsec is None and "not known" in found.line
+
+
+def test_a_bench_without_the_table_has_none(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text())
+    assert cube_to_boresight(read_bench_file(path), None) is None

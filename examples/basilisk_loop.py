@@ -154,7 +154,7 @@ def display_and_tracker(
         "--headless",
         "--duration",
         str(seconds + 30),
-        "--frames",
+        "--feed",
         frames,
     ]
     looks = [

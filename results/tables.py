@@ -6,8 +6,10 @@ timing.csv and those of colour by `hilstar study NAME -o`, quantisation_time.csv
 by `hilstar study quantisation -o`. machine.txt says on which machine; bench_h100.csv on an NVIDIA
 H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200. chain.csv and
 chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+rigs.csv is `hilstar study rigs -o DIR`, and no machine changes it.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
+beside_*.csv are `python tools/beside.py NAME -o DIR`, and no machine changes them.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine
 changes it.
 """
@@ -17,6 +19,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -107,6 +110,15 @@ def kinds_table() -> str:
     return table(["ms, median", "stars", "codes", *dict.fromkeys(r["kind"] for r in rows)], body)
 
 
+def error_text(error: float, unit: str) -> str:
+    """An error with its unit, a share of 1 in per cent."""
+    if error == 0:
+        return "none"
+    if unit == "1":
+        return f"{figure(100 * error)} %"
+    return f"{figure(error)} {unit}"
+
+
 def tradeoff_table() -> str:
     """Each step's default beside its exact method."""
     steps: dict[str, list[dict[str, str]]] = {}
@@ -116,11 +128,7 @@ def tradeoff_table() -> str:
     for step, rows in steps.items():
         default = next(row for row in rows if row["default"] == "True")
         exact = [row for row in rows if row["exact"] == "True" and row is not default]
-        error = (
-            "none"
-            if float(default["error"]) == 0
-            else f"{figure(float(default['error']))} {default['error_unit']}"
-        )
+        error = error_text(float(default["error"]), default["error_unit"])
         beside = f"{exact[0]['method']}: {figure(float(exact[0]['time_ms']))} ms" if exact else "-"
         body.append(
             [step, default["method"], error, f"{figure(float(default['time_ms']))} ms", beside]
@@ -494,7 +502,45 @@ def certify_table() -> str:
     return table(head, body)
 
 
+BESIDE = ("galsim", "astrometry", "lost")
+
+
+def beside_table(name: str) -> str:
+    """What stands between hilstar and an independent program, cause by cause."""
+    body = []
+    subject = ""
+    for row in rows_of(f"beside_{name}.csv"):
+        first = row["subject"] if row["subject"] != subject else ""
+        subject = row["subject"]
+        size = two_digits(float(row["size"]))
+        body.append([first, row["step"], f"{size} {UNIT_WORDS.get(row['unit'], row['unit'])}"])
+    version = f"{row['program']} {row['version']}, {row['date']}"
+    return table([version, "taken out, one after the other", "difference"], body)
+
+
+UNIT_WORDS = {"relative": "of it"}
+
+
+def rigs_table() -> str:
+    """What is published of rigs, what is predicted of it, and what hilstar's codes would leave."""
+
+    def cell(value: str, unit: str) -> str:
+        size = float(value)
+        return "" if math.isnan(size) else f"{size:.3g} {unit}"
+
+    body = []
+    for row in rows_of("rigs.csv"):
+        unit = row["unit"].split()[0].rstrip(",")
+        figures = [cell(row[name], unit) for name in ("published", "predicted", "difference")]
+        body.append([row["rig"], row["figure"], *figures, cell(row["with_hilstar"], unit)])
+    return table(
+        ["rig", "figure", "published", "predicted", "difference", "hilstar's codes there"], body
+    )
+
+
 TABLES = {
+    **{f"beside_{name}": partial(beside_table, name) for name in BESIDE},
+    "rigs": rigs_table,
     "answers": answers_table,
     "certify": certify_table,
     "colour": colour_table,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import api_page
+import claims
 import command_page
 import drawings
 
@@ -16,6 +17,7 @@ from hilstar.server.bench.config import reference
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES: dict[str, Callable[[], str]] = {
     "bench-file.md": reference.page,
+    "claims.md": claims.page,
     "commands.md": command_page.page,
     "python-api.md": api_page.page,
     **drawings.DRAWINGS,

@@ -35,7 +35,7 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 FIRST_ASKS = 8  # quickly, so that the clock is soon known
 QUICK_ASK_NS = NS_PER_S // 10
-ASK_NS = NS_PER_S // 2
+ASK_NS = NS_PER_S // 2  # after the FIRST_ASKS
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
 POLL_MS = 20
 MAX_PASSED_ON = 10
@@ -118,7 +118,8 @@ class BackChannel:
             }
             self._asked[self._asks] = request
             self._quick_asks -= 1
-            self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
+            pause_ns = QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS
+            self._next_ask_ns = now_ns + pause_ns
             self._send(request)
         while self._answers:
             self._send(self._answers.popleft())
@@ -356,11 +357,13 @@ class Receiver:
             # The newest of those that arrived while this thread slept woke it; the others had to
             # wait.
             timely = not waits and k == len(arrivals) - 1
-            if timely:
+            if self._link.stamped:
+                waited_ns = arrival.waited_ns
+            elif timely:
                 waited_ns = 0
             else:
                 waited_ns = arrival.host_ns - self._empty_ns
-            self._take(arrival, arrival.waited_ns if self._link.stamped else waited_ns)
+            self._take(arrival, waited_ns)
         now_ns = self._now_ns()
         self._state.busy = bool(arrivals)
         self._stages.expire(now_ns)
@@ -404,12 +407,13 @@ class Receiver:
                     )
                 )
                 self._tell_clock()
+            case wire.Refusal() as refusal:
+                self.counts.received += 1
+                self._refuse(arrival, refusal)
             case other:
                 self.counts.received += 1
-                refusal = wire.Refusal(
-                    "format", f"a {type(other).__name__} packet is not an attitude"
-                )
-                self._refuse(arrival, other if isinstance(other, wire.Refusal) else refusal)
+                detail = f"a {type(other).__name__} packet is not an attitude"
+                self._refuse(arrival, wire.Refusal("format", detail))
 
     def _arrived(self, arrival: SampleArrival) -> SampleArrival:
         """Look at the time of any sender's message."""

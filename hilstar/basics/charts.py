@@ -37,6 +37,8 @@ PNG_DPI = 150
 TITLE_PT, TEXT_PT, SMALL_PT = 11.5, 10, 9
 TITLE_COLUMNS, NOTE_COLUMNS = 80, 105
 ENDINGS = (".png", ".svg")
+# from a curve's name to its end, where they are apart
+ARROW = {"arrowstyle": "-", "alpha": 0.5, "lw": 0.8, "shrinkB": 3, "relpos": (0, 0.5)}
 
 # The colours of a chart, and of each its colour on a dark page.
 INK, MUTED, GRID, PAPER = "#1f2328", "#5c6570", "#d8dde3", "#ffffff"
@@ -61,6 +63,7 @@ DARK = {
     TEAL: "#56cfe0",
     RED: "#ff7b7b",
 }
+KEY = re.compile(r"\w+(?:_|\.)\w")
 # by figure, while it is drawn
 _SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()
 STYLE: Any = {
@@ -107,7 +110,10 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
     where it cannot be written.
     """
     columns = [field.name for field in fields(records[0])]
-    write_csv(path, columns, [[getattr(record, name) for name in columns] for record in records])
+    rows = []
+    for record in records:
+        rows.append([getattr(record, name) for name in columns])
+    write_csv(path, columns, rows)
 
 
 @contextmanager
@@ -155,6 +161,7 @@ def panels_of(
         grid = figure.subplots(
             rows, columns, sharex=share_x, sharey=share_y, squeeze=False, height_ratios=heights
         )
+        finding = finding.replace(" +- ", " \N{PLUS-MINUS SIGN} ")
         figure.suptitle(title_lines(capital(finding)), x=0.01, ha="left", fontsize=TITLE_PT)
         if note:
             figure.supxlabel(
@@ -186,10 +193,9 @@ def finish(figure: "Figure") -> None:
         panels.
         """
         for axis in log_axes:
-            log_ticks(
-                axis,
-                axis.axes.bbox.width / 45 if axis.axis_name == "x" else axis.axes.bbox.height / 25,
-            )
+            box = axis.axes.bbox
+            room = box.width / 45 if axis.axis_name == "x" else box.height / 25
+            log_ticks(axis, room)
         for text in texts:
             text.remove()
         texts[:] = [text for axes, named in side_names for text in _name_at_side(axes, named)]
@@ -205,8 +211,10 @@ def finish(figure: "Figure") -> None:
 
 
 def capital(text: str) -> str:
-    """A text with a capital first, unless it begins with a symbol of one letter (x, y)."""
-    if re.match(r"\w\w|a ", text):
+    """A text with a capital first, unless it begins with a symbol of one letter (x, y) or a key
+    of a file (tracker.aperture_mm).
+    """
+    if re.match(r"\w\w|a ", text) and not KEY.match(text):
         return text[:1].upper() + text[1:]
     return text
 
@@ -224,10 +232,10 @@ def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:
         return textwrap.wrap(bound, width, break_on_hyphens=False)
 
     count = len(wrapped(columns))
-    narrowest = next(
-        (w for w in range(len(bound) // count, columns) if len(wrapped(w)) == count), columns
-    )
-    return "\n".join(wrapped(narrowest))
+    width = len(bound) // count
+    while width < columns and len(wrapped(width)) > count:
+        width += 1
+    return "\n".join(wrapped(width))
 
 
 def plain_ticks(axis: "Axis", values: Sequence[float]) -> None:
@@ -278,9 +286,8 @@ def log_ticks(axis: "Axis", room: float) -> None:
                 for step in steps:
                     ticks.append(step * 10.0**power)
         ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-        if min((b / a for a, b in itertools.pairwise(ticks)), default=high) > (high / low) ** (
-            1 / room
-        ):
+        smallest_ratio = min((b / a for a, b in itertools.pairwise(ticks)), default=high)
+        if smallest_ratio > (high / low) ** (1 / room):
             break
     plain_ticks(axis, ticks)
 
@@ -314,42 +321,39 @@ def _line_ends(axes: "Axes") -> Iterator[tuple[str, tuple[float, float], str]]:
         ]
         if len(ends) and not str(line.get_label()).startswith("_"):
             x, y = (float(value) for value in ends[ends[:, 0].argmax()])
-            place = (x if x_is_data else high), y
-            yield str(line.get_label()), place, str(line.get_color())
+            if not x_is_data:
+                x = high
+            yield str(line.get_label()), (x, y), str(line.get_color())
 
 
 def _name_at_side(axes: "Axes", named: SideNames) -> "list[Annotation]":
     """The names of a panel, kept apart at its present height, with arrows to far points."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
     texts: list[Annotation] = []
-    at = {
-        each: axes.transAxes.inverted().transform(axes.transData.transform(each[1]))
-        for each in named or _line_ends(axes)
-    }
-    falling = sorted(at, key=lambda each: -at[each][1])
-    for each, height in zip(
-        falling, spread([float(at[curve][1]) for curve in falling], gap), strict=True
-    ):
-        name, place, colour = each
-        far = abs(height - at[each][1]) > gap / 3 or at[each][0] < 0.93
-        arrow = {
-            "arrowstyle": "-",
-            "color": colour,
-            "alpha": 0.5,
-            "lw": 0.8,
-            "shrinkB": 3,
-            "relpos": (0, 0.5),
-        }
+    places = {}  # in parts of the axes
+    for curve in named or _line_ends(axes):
+        at_px = axes.transData.transform(curve[1])
+        places[curve] = axes.transAxes.inverted().transform(at_px)
+    falling = sorted(places, key=lambda curve: -places[curve][1])
+    heights = spread([float(places[curve][1]) for curve in falling], gap)
+    for curve, height in zip(falling, heights, strict=True):
+        name, point, colour = curve
+        arrow = None
+        text_x = 1.015
+        is_far = abs(height - places[curve][1]) > gap / 3 or places[curve][0] < 0.93
+        if is_far:
+            arrow = ARROW | {"color": colour}
+            text_x = 1.035
         texts.append(
             axes.annotate(
                 name,
-                place,
-                (1.035 if far else 1.015, height),
+                point,
+                (text_x, height),
                 textcoords="axes fraction",
                 va="center",
                 fontsize=SMALL_PT,
                 color=colour,
-                arrowprops=arrow if far else None,
+                arrowprops=arrow,
                 annotation_clip=False,
             )
         )
@@ -359,8 +363,10 @@ def _name_at_side(axes: "Axes", named: SideNames) -> "list[Annotation]":
 def spread(heights: Sequence[float], gap: float) -> list[float]:
     """Falling heights moved apart by at least `gap`, within 0 and 1 where there is room."""
     placed: list[float] = []
+    highest = 1.0
     for height in heights:
-        placed.append(min(float(height), 1.0 if not placed else placed[-1] - gap))
+        placed.append(min(float(height), highest))
+        highest = placed[-1] - gap
     lowest = 0.0
     for k in reversed(range(len(placed))):
         placed[k] = max(placed[k], lowest)

@@ -77,7 +77,7 @@ class _Kind:
     detail: str = ""
 
     def words(self, notice: Notice) -> str | None:
-        """What to say of one more; None where it is only counted."""
+        """The line for one more notice of this kind; None where it is only counted."""
         now_ns = notice.host_ns
         if now_ns < self.until_ns:
             self.last_ns, self.unsaid = now_ns, self.unsaid + 1

@@ -9,12 +9,12 @@ report has its own layout and the same palette, light on paper too.
 import base64
 import html
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilstar.basics.charts import svg
+from hilstar.basics.charts import svg, two_digits
 from hilstar.basics.palette import declarations
 
 DIGITS = 4
@@ -22,6 +22,7 @@ MAX_FIGURE_CHARACTERS = 40  # of a figure with its uncertainty; more are a sente
 STYLE = Path(__file__).with_suffix(".css")
 SHAPE = "--radius: 12px;"
 PLUS_MINUS, DASH, THIN_SPACE = "\N{PLUS-MINUS SIGN}", "\N{EM DASH}", "\N{NARROW NO-BREAK SPACE}"
+TIMES = "\N{MULTIPLICATION SIGN}"
 # Of keys, the longest first: what a key ends with, and its unit as a page writes it.
 KEY_UNITS = (
     ("_percent_per_h", "%/h"),
@@ -45,6 +46,19 @@ KEY_UNITS = (
     ("_k", "K"),
     ("_s", "s"),
 )
+# Parts of keys that a person does not read as words.
+KEY_WORDS = {
+    "psf": "PSF",
+    "p95": "at 95 %",
+    "dof": "degrees of freedom",
+    "q": "quaternion",
+    "gl": "OpenGL",
+}
+# A table wider than its page is moved by the keyboard, too.
+WIDE_TABLE = '<div class="wide-table" tabindex="0" role="group" aria-label="Table">'
+UNITS = dict(KEY_UNITS)
+MIN_PLAIN = 1e-4  # smaller numbers are written as powers of ten
+ERROR = "_error"  # of keys: `drift_error_ms` is the standard error of `drift_ms`
 OK, WARN, BAD, PLAIN = "ok", "warn", "bad", "plain"  # the states of verdicts, chips and figures
 
 
@@ -175,14 +189,74 @@ def escaped(value: object) -> str:
 
 def key_words(key: str) -> str:
     """A key as a person reads it: `drift_ms` is "drift, ms"."""
-    for ending, unit in KEY_UNITS:
+    name, ending = split_key(key)
+    if ending:
+        return f"{_words(name)}, {UNITS[ending]}"
+    return _words(name)
+
+
+def key_name(key: str) -> str:
+    """A key as a person reads it, without its unit."""
+    return _words(split_key(key)[0])
+
+
+def split_key(key: str) -> tuple[str, str]:
+    """A key without the ending that is its unit, and that ending, "" without one."""
+    for ending, _ in KEY_UNITS:
         if key.endswith(ending):
-            return f"{_words(key.removesuffix(ending))}, {unit}"
-    return _words(key)
+            return key.removesuffix(ending), ending
+    return key, ""
 
 
 def _words(key: str) -> str:
-    return key.replace("_", " ")
+    return " ".join(KEY_WORDS.get(word, word) for word in key.split("_"))
+
+
+def keyed_rows(figures: Mapping[str, object]) -> list[tuple[str, str]]:
+    """Figures by key as rows of a table: the key in words, and its value with error and unit.
+
+    The error of `drift_ms` is `drift_error_ms`, which then has no row. What is empty has none.
+    """
+    rows = []
+    for key, value in figures.items():
+        name, ending = split_key(key)
+        if f"{name.removesuffix(ERROR)}{ending}" in figures and name.endswith(ERROR):
+            continue
+        if value is None or value in ("", {}):
+            continue
+        error = figures.get(f"{name}{ERROR}{ending}")
+        rows.append((_words(name), value_text(value, error, UNITS.get(ending, ""))))
+    return rows
+
+
+def value_text(value: object, error: object = None, unit: str = "") -> str:
+    """A value as a page writes it: numbers to four digits, or to two of their error; sizes
+    as "1920 x 1080".
+    """
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if isinstance(error, (int, float)) and math.isfinite(error) and error > 0:
+            return measured(value, error, unit)
+        return f"{_number(value)} {unit}".rstrip()
+    if isinstance(value, (list, tuple)):
+        between = f" {TIMES} " if len(value) == 2 else ", "
+        texts = between.join(value_text(part) for part in value)
+        return f"{texts} {unit}".rstrip()
+    if isinstance(value, Mapping):
+        return "; ".join(f"{_words(str(key))} {value_text(part)}" for key, part in value.items())
+    return str(value)
+
+
+def _number(value: float) -> str:
+    """A number to four digits, whole ones whole, and very small ones as a power of ten."""
+    size = abs(value)
+    if math.isfinite(value) and size >= 10**DIGITS:
+        digits = DIGITS - 1 - math.floor(math.log10(size))
+        return _rounded(value, 0 if isinstance(value, int) else digits)
+    if isinstance(value, int):
+        return str(value)
+    if 0 < size < MIN_PLAIN:
+        return two_digits(value)
+    return f"{value:.{DIGITS}g}"
 
 
 def paragraph(text: object, kind: str = "") -> str:
@@ -196,6 +270,12 @@ def list_of(items: Iterable[object]) -> str:
     """A list of texts."""
     lines = "".join(f"<li>{escaped(item)}</li>" for item in items)
     return f"<ul>{lines}</ul>"
+
+
+def side_by_side(cards: Iterable[Card]) -> str:
+    """Cards without pictures, two beside each other where there is room."""
+    sections = "".join(card.html() for card in cards)
+    return f'<div class="pair">{sections}</div>'
 
 
 def details_of(summary: str, *parts: str, printed: bool = False) -> str:
@@ -236,6 +316,14 @@ def _rounded(value: float, digits: int) -> str:
     return text.replace(",", THIN_SPACE)
 
 
+def key_table(rows: Iterable[tuple[object, object]]) -> str:
+    """A table of names and texts, without a header; both stand at the left."""
+    lines = []
+    for name, text in rows:
+        lines.append(f'<tr><th scope="row">{escaped(name)}</th><td>{escaped(text)}</td></tr>')
+    return f"{WIDE_TABLE}<table>{''.join(lines)}</table></div>"
+
+
 def table_of(
     rows: Iterable[Sequence[object]], header: Sequence[str] = (), digits: int = DIGITS
 ) -> str:
@@ -256,7 +344,7 @@ def table_of(
         cells = "".join(_cell(row[column], digits) for column in shown if column < len(row))
         lines.append(f"<tr>{cells}</tr>")
     body = "".join(lines)
-    return f'<div class="wide-table"><table>{body}</table></div>'
+    return f"{WIDE_TABLE}<table>{body}</table></div>"
 
 
 def _has_values(table: list[list[object]], column: int) -> bool:

@@ -14,6 +14,12 @@ STEP = 0.002  # the width of a bin, relative to the value: how exactly a percent
 BINS = math.ceil(math.log(MAX_SIZE / MIN_SIZE) / STEP)
 
 
+def _times(value: float | None, factor: float) -> float | None:
+    if value is None:
+        return None
+    return value * factor
+
+
 class Percentiles(msgspec.Struct, frozen=True):
     """Median, 99th percentile and maximum of a figure; None without a value."""
 
@@ -24,7 +30,7 @@ class Percentiles(msgspec.Struct, frozen=True):
     def times(self, factor: float) -> "Percentiles":
         """The same in another unit."""
         return Percentiles(
-            *(None if value is None else value * factor for value in (self.p50, self.p99, self.max))
+            _times(self.p50, factor), _times(self.p99, factor), _times(self.max, factor)
         )
 
 

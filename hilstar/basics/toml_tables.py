@@ -128,16 +128,19 @@ def toml_text(tables: Mapping[str, Any]) -> str:
     A list of lists stands row by row. Arrays and numbers of NumPy, and paths, are written as what
     they hold. Raises TypeError for a value that TOML does not have.
     """
-    plain_keys = {key: value for key, value in tables.items() if not isinstance(value, Mapping)}
-    parts = {"": plain_keys} | {
-        f"[{_key(name)}]\n": value for name, value in tables.items() if isinstance(value, Mapping)
-    }
+    plain_keys: dict[str, Any] = {}
+    tables_by_head: dict[str, Mapping[str, Any]] = {"": plain_keys}
+    for name, value in tables.items():
+        if isinstance(value, Mapping):
+            tables_by_head[f"[{_key(name)}]\n"] = value
+        else:
+            plain_keys[name] = value
     texts = []
-    for head, part in parts.items():
-        rows = "".join(
-            f"{_key(key)} = {_rows(value)}\n" for key, value in part.items() if value is not None
-        )
-        texts += [head + rows] if rows else []
+    for head, table in tables_by_head.items():
+        stated = {key: value for key, value in table.items() if value is not None}
+        if stated:
+            rows = [f"{_key(key)} = {_rows(value)}\n" for key, value in stated.items()]
+            texts.append(head + "".join(rows))
     return "\n".join(texts)
 
 

@@ -83,10 +83,8 @@ class WrongSky:
             if kind in ENDS:
                 self.any = True
                 self._texts.setdefault(kind, text)
-                self._now.setdefault(
-                    kind,
-                    Condition(kind, text, host_ns if since_ns is None else min(since_ns, host_ns)),
-                )
+                begin_ns = host_ns if since_ns is None else min(since_ns, host_ns)
+                self._now.setdefault(kind, Condition(kind, text, begin_ns))
                 return
             ended = self._now.pop(BEGINS[kind], None)
             if ended is not None:
@@ -128,13 +126,14 @@ class WrongSky:
         return WrongSkyTotal(_seconds(every, from_ns, to_ns), conditions)
 
     def _spans(self) -> list[tuple[str, list[_Span]]]:
-        found = []
+        spans_by_kind = []
         for kind in self._texts:
             spans = list(self._past.get(kind, ()))
-            if (condition := self._now.get(kind)) is not None:
+            condition = self._now.get(kind)
+            if condition is not None:
                 spans.append(_Span(condition.since_ns, FOR_EVER_NS))
-            found.append((kind, spans))
-        return found
+            spans_by_kind.append((kind, spans))
+        return spans_by_kind
 
 
 def _covers(spans: Sequence[_Span], host_ns: int) -> bool:

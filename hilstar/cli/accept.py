@@ -54,7 +54,9 @@ def accept(
     ] = None,
     workers: Annotated[
         int | None,
-        Option(help="Processes on this machine; by default one a core.", min=1, max=1024),
+        Option(
+            metavar="N", help="Processes on this machine; by default one a core.", min=1, max=1024
+        ),
     ] = None,
     solver: Annotated[
         str,
@@ -66,9 +68,7 @@ def accept(
     headless: Headless = False,
     windowed: running.Windowed = False,
     force: running.Force = False,
-    frames: Annotated[
-        str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")
-    ] = None,
+    feed: running.Feed = None,
     strict: Annotated[
         bool, Option("--strict", help="Exit with code 1 where a clause is not met.")
     ] = False,
@@ -89,7 +89,7 @@ def accept(
     checked = read_acceptance_plan(plan_path(plan), bench, quick, through)
     acceptance = Acceptance(checked, bench, output, solver, solver_timeout)
     of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
-    of_bench["--frames"] = frames is not None
+    of_bench["--feed"] = feed is not None
     of_tracker = {"--workers": workers is not None, "--solver": solver != CENTROIDS}
     _check_options(acceptance.on_bench, of_bench, of_tracker)
     acceptance.check()
@@ -107,7 +107,7 @@ def accept(
         shown_bench = partial(
             running.shown_bench, headless=headless, windowed=windowed, force=force, timed=True
         )
-        show_cases(campaign, directory, shown_bench, frames, None)
+        show_cases(campaign, directory, shown_bench, feed, None)
 
     results = acceptance.run(run_missing)
     verdicts = acceptance.verdicts(results)

@@ -9,6 +9,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError
 from hilstar.cli import options
+from hilstar.cli.pointing import QuaternionText, RadecText, StarText, optional_attitude
 from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -42,14 +43,15 @@ def answers(
             help="Show which bytes became which field, and each answer under every convention.",
         ),
     ] = False,
-    radec: options.RadecText = None,
-    quaternion: options.QuaternionText = None,
-    seconds: Annotated[
+    radec: RadecText = None,
+    star: StarText = None,
+    quaternion: QuaternionText = None,
+    duration: Annotated[
         float | None,
         Option(
-            "--seconds",
-            metavar="S",
-            help="End after so long; by default with Ctrl-C.",
+            "--duration",
+            metavar="SECONDS",
+            help="Seconds to run; by default until Ctrl-C.",
             min=0.1,
             max=1e7,
         ),
@@ -59,9 +61,9 @@ def answers(
     """Decode a tracker's answers by `[answers]`, live or recorded: each as a line, and why bytes
     were refused.
 
-    With --explain each answer is compared with what is shown: --radec or --quaternion, or else the
-    newest frame of a run with --console, or what the sender of [attitude] says now, where that is a
-    ZeroMQ stream.
+    With --explain each answer is compared with what is shown: --radec, --star or --quaternion, or
+    else the newest frame of a run with --console, or what the sender of [attitude] says now, where
+    that is a ZeroMQ stream.
     """
     from collections import Counter, deque
 
@@ -75,13 +77,14 @@ def answers(
         raise InputError(
             f'{bench}: has no [answers]; write the table, with source = "serial" or the like'
         )
-    shown = options.parse_attitude("answers", radec, quaternion) if radec or quaternion else None
+    epoch_jyear = file.config.sky.epoch_jyear
+    shown = optional_attitude("answers", radec, star, quaternion, epoch_jyear)
     plan = ReadPlan(file.config.answers, file.folder, file.config.tracker.q_body_to_cam)
     counts: Counter[str] = Counter()
     if shown is None and explain and recorded is None:
         shown = _shown_now(file)
     if recorded is None:
-        decoder, answer_stream = _live(plan, seconds)
+        decoder, answer_stream = _live(plan, duration)
     else:
         decoder = plan.decoder(messages=False)
         answer_stream = recorded_answers(plan, decoder, recorded)

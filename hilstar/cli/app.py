@@ -20,6 +20,7 @@ COMMANDS = {
     "Calibrate": ("first_light", "latency", "certify"),
     "Study": ("study", "benchmark"),
     "This machine": ("doctor",),
+    "Help": ("help_",),
 }
 CALIBRATE = (
     "Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by"
@@ -103,6 +104,12 @@ def public(name: str) -> str:
     return name.strip("_").replace("_", "-")
 
 
+def names() -> list[str]:
+    """The commands and groups, as `hilstar --help` orders them."""
+    alone = [public(name) for panel in COMMANDS.values() for name in panel]
+    return [*alone, *GROUPS]
+
+
 @cache
 def application(only: str | None = None) -> typer.Typer:
     """The commands of `hilstar`, or `only` the command or group of a name: each imports its
@@ -115,14 +122,14 @@ def application(only: str | None = None) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(hilstar)
-    for panel, names in COMMANDS.items():
-        for name in names:
+    for panel, files in COMMANDS.items():
+        for name in files:
             if only in (None, public(name)):
                 add(app, name, name, panel)
-    for group, (panel, group_help, names) in GROUPS.items():
+    for group, (panel, group_help, functions) in GROUPS.items():
         if only in (None, group):
             members = typer.Typer(help=group_help)
-            for name in names:
+            for name in functions:
                 add(members, group, name)
             app.add_typer(members, name=group, rich_help_panel=panel)
     return app
@@ -143,5 +150,4 @@ def run(words: list[str]) -> Any:
     if not words or (len(words) == 1 and words[0] in GROUPS):
         run([*words, "--help"])
         return InputError.exit_code
-    names = {public(name) for names in COMMANDS.values() for name in names} | GROUPS.keys()
-    return built(words[0] if words[0] in names else None)(words, standalone_mode=False)
+    return built(words[0] if words[0] in names() else None)(words, standalone_mode=False)

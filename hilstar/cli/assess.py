@@ -8,7 +8,7 @@ from typer import Argument, Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import Json, RunFile, check_files
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 MAX_LATENCY_MS = 1e7
 
@@ -76,12 +76,12 @@ def assess(
     check_files(
         [ledger, *([] if telemetry is None else [telemetry])], [output / name for name in names]
     )
-    assessment = assess_files(
-        ledger, telemetry, AssessSettings(stamp, latency_ms / 1e3, display_attitudes)
-    )
-    make_directory(output)
-    write_tables(output, assessment)
-    write_page(output / "budget.html", assessment)
+    settings = AssessSettings(stamp, latency_ms / 1e3, display_attitudes)
+    with busy("finding the tracker's error budget"):
+        assessment = assess_files(ledger, telemetry, settings)
+        make_directory(output)
+        write_tables(output, assessment)
+        write_page(output / "budget.html", assessment)
     rows = [
         *lines_of(assessment),
         *(("note", note) for note in assessment.notes),

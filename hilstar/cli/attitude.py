@@ -8,7 +8,7 @@ from typer import Argument, Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
 from hilstar.cli import options
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
@@ -28,10 +28,10 @@ def attitude(
             help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.",
         ),
     ],
-    at: Annotated[
+    time: Annotated[
         str | None,
         Option(
-            "--at",
+            "--time",
             metavar="T",
             help=(
                 "Seconds after the log's first sample, or a date and time as the log has them; by"
@@ -47,7 +47,8 @@ def attitude(
         ),
     ] = None,
     wait: Annotated[
-        float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)
+        float,
+        Option(metavar="SECONDS", help="How long to wait for a live stream.", min=0.1, max=1e6),
     ] = 10.0,
     statements: options.LogStatements = options.NOTHING_STATED,
     explain: Annotated[
@@ -83,11 +84,11 @@ def attitude(
         statements.refuse(f"it is for a log, and {source} names a live stream; leave it out")
     stated = statements.stated(first.config)
     if live:
-        sample, conventions, held = _live(first, at, wait)
+        sample, conventions, held = _live(first, time, wait)
         for _, line in conventions.mounting_notices(stated.mounting):
             say(line)
     else:
-        sample, conventions, held = _of_log(source, at, stated)
+        sample, conventions, held = _of_log(source, time, stated)
     file = dated(file, conventions.scale, sample.t_ns)
     fields = {"source": conventions.source, "held": held, **_pointing(sample, file)}
     meaning = conventions.lines(stated.mounting)
@@ -102,12 +103,12 @@ class _Found(NamedTuple):
     held: bool = False
 
 
-def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
+def _live(file: "BenchFile", time: str | None, patience_s: float) -> _Found:
     from hilstar.server.open_link import first_attitude, open_link
 
-    if at is not None:
+    if time is not None:
         raise InputError(
-            f"--at {at}: a live stream has only its present; leave --at out, or give a log"
+            f"--time {time}: a live stream has only its present; leave --time out, or give a log"
         )
     with open_link(file.config, file.folder) as link:
         if link.steps:
@@ -115,10 +116,12 @@ def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
                 f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar"
                 " serve --explain"
             )
-        return _Found(first_attitude(link, patience_s), link.conventions)
+        with busy(f"waiting for an attitude, {patience_s:g} s at most"):
+            sample = first_attitude(link, patience_s)
+        return _Found(sample, link.conventions)
 
 
-def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
+def _of_log(path: Path, time: str | None, stated: "Stated") -> _Found:
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
     from hilstar.attitude.wire.packet import AttitudeSample
@@ -127,7 +130,7 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
     joins = log.joins()
     for _, line in [*log.told, *joins.told]:
         say(line)
-    t_ns = time_in_log(path, log.samples, at)
+    t_ns = time_in_log(path, log.samples, time)
     state = log_timeline(log.samples, Policy(0, 0), joins).at(t_ns)
     if state is None:
         raise AssertionError("a log has samples")

@@ -8,7 +8,7 @@ from typer import Argument, Option
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.options import MAX_SEED, Json, parse_counts, parse_sizes
+from hilstar.cli.options import Json, parse_counts, parse_sizes, seed_option
 from hilstar.server.console.terminal import print_found, progress
 
 OwnBench = Annotated[
@@ -23,9 +23,7 @@ def benchmark(
     ] = False,
     stars: Annotated[str | None, Option(metavar="N,N,...", help="Stars in view.")] = None,
     sizes: Annotated[str | None, Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
-    seed: Annotated[
-        int, Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)
-    ] = 1,
+    seed: Annotated[int, seed_option("Seed of the random stars beyond the catalogue.")] = 1,
     output: Annotated[
         Path | None,
         Option(

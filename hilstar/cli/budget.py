@@ -9,9 +9,11 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
+from hilstar.cli.completion import centroiders, offered, sensor_names
+from hilstar.cli.options import BenchFile, Json
+from hilstar.cli.pointing import RadecText, StarText, optional_attitude
 from hilstar.cli.running import say_optics
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.server.bench import bench_file as benches
@@ -26,11 +28,13 @@ def budget(
     centroider: Annotated[
         str | None,
         Option(
+            metavar="NAME",
+            autocompletion=offered(centroiders),
             help=(
                 "Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or"
                 " box5 (centres of mass), or "
                 "all of them; what the bench has under verify, or fit, unless given."
-            )
+            ),
         ),
     ] = None,
     noise: Annotated[
@@ -41,11 +45,13 @@ def budget(
         ),
     ] = False,
     radec: RadecText = None,
+    star: StarText = None,
     sensor: Annotated[
         str | None,
         Option(
             "--sensor",
             metavar="NAME",
+            autocompletion=offered(sensor_names),
             help="Whether this sensor (imx250, ...) behind the bench's lens is sensitive enough.",
         ),
     ] = None,
@@ -64,12 +70,13 @@ def budget(
         if centroider is not None:
             option = "--sensor" if sensor is not None else "--noise"
             raise InputError(f"budget {option}: has every centroider; leave out --centroider")
-        star_noise(bench_file, output, radec, sensor, as_json)
+        star_noise(bench_file, output, radec, star, sensor, as_json)
         return
-    if radec is not None:
-        raise InputError(
-            "budget --radec: names a field of stars whose noise is wanted; add --noise"
-        )
+    for option, given in (("--radec", radec), ("--star", star)):
+        if given is not None:
+            raise InputError(
+                f"budget {option}: names a field of stars whose noise is wanted; add --noise"
+            )
     choices: tuple[By, ...] = (*FAMILY, "all")
     by = next((choice for choice in choices if choice == centroider), None)
     if centroider is not None and by is None:
@@ -77,12 +84,13 @@ def budget(
         raise InputError(
             f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}"
         )
-    with load(bench_file) as bench:
+    with busy("finding the budget"), load(bench_file) as bench:
         fields = fields_of_view(bench.config, bench.file.folder)
         star_budget = find_budget(bench, by)
         assumed = shares_line(bench) or colour_line(bench)
     if output is not None:
-        write_report(make_directory(output), star_budget)
+        with busy("drawing the chart"):
+            write_report(make_directory(output), star_budget)
     print_found(as_json, star_budget, budget_lines(star_budget))
     say_optics(fields, star_budget.star)
     if assumed is not None:
@@ -90,7 +98,12 @@ def budget(
 
 
 def star_noise(
-    bench_file: Path, output: Path | None, radec: str | None, sensor: str | None, as_json: bool
+    bench_file: Path,
+    output: Path | None,
+    radec: str | None,
+    star: str | None,
+    sensor: str | None,
+    as_json: bool,
 ) -> None:
     """The noise of the tracker's own stars, or of those of another sensor behind its lens."""
     import numpy as np
@@ -104,16 +117,15 @@ def star_noise(
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.tracker.centroids import CentroidSettings
 
-    if radec is None:
-        attitude = None
-    else:
-        attitude = parse_attitude("budget", radec, None)
     file = read_bench_file(bench_file)
+    epoch_jyear = file.config.sky.epoch_jyear
+    attitude = optional_attitude("budget", radec, star, None, epoch_jyear)
     if sensor is not None:
         file = with_its_figures(file, sensor)
-    noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
-    if output is not None:
-        write_noise(make_directory(output), noise)
+    with busy("finding the noise"):
+        noise = noise_budget(file, attitude, CentroidSettings(), np.random.default_rng(0))
+        if output is not None:
+            write_noise(make_directory(output), noise)
     answer = [] if sensor is None else [sensitivity_line(noise)]
     print_found(as_json, noise, [*answer, *noise_lines(noise)])
 
@@ -122,13 +134,16 @@ def with_its_figures(file: "benches.BenchFile", name: str) -> "benches.BenchFile
     """The bench with another sensor, and a line about where its figures are from."""
     from hilstar.basics.reading import parse_toml
     from hilstar.server.bench.bench_file import changed_file
-    from hilstar.server.bench.config.sensor import lacking, other_sensor
+    from hilstar.server.bench.config.sensor import lacking, named_keys, other_sensor
     from hilstar.tracker.sensors import sensor_named
 
-    tables, kept = other_sensor(parse_toml(file.path, file.text), name)
-    changed = changed_file(file, tables)
+    other = other_sensor(parse_toml(file.path, file.text), name)
+    changed = changed_file(file, other.tables)
     sensor = sensor_named(name, "--sensor")
     say(f"{sensor.name}: {sensor.source}")
-    if kept:
-        say(f"its sheet has no {lacking(sensor, kept)}: the bench's stand")
+    if other.kept:
+        beside = f", with {named_keys(other.beside)}" if other.beside else ""
+        say(f"its sheet has no {lacking(sensor, other.kept)}: the bench's stand{beside}")
+    if other.dropped:
+        say(f"left out, as they are the old sensor's: {named_keys(other.dropped)}")
     return changed

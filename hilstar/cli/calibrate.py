@@ -20,17 +20,18 @@ from hilstar.basics.files import (
     make_directory,
     refuse_stdout,
 )
+from hilstar.cli.image_source import Exposure, Grab, ShownTo, dot_images
 from hilstar.cli.options import (
-    MAX_SEED,
     BenchFile,
     Json,
     Overwrite,
     check_files,
     parse_numbers,
     parse_reading,
+    seed_option,
 )
 from hilstar.cli.running import Windowed
-from hilstar.server.console.terminal import print_found, print_json, say
+from hilstar.server.console.terminal import busy, print_found, print_json, say
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 NAMED = "in the bench file, under [collimator]: geometry = {!r}"
@@ -42,11 +43,12 @@ def dots(
     output: Annotated[
         Path, Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")
     ],
-    frames: Annotated[int, Option(help="Number of frames.", min=1, max=1000)] = 20,
+    frames: Annotated[int, Option(metavar="N", help="Number of frames.", min=1, max=1000)] = 20,
     dots_per_frame: Annotated[
         int | None,
         Option(
             "--dots",
+            metavar="N",
             help="About how many dots are lit in each. [as many as the field holds, 60 at most]",
             min=1,
             max=5000,
@@ -56,12 +58,12 @@ def dots(
         bool,
         Option("--show", help="Show the frames on the display: space for the next, q to quit."),
     ] = False,
-    seconds: Annotated[
+    dwell: Annotated[
         float | None,
-        Option(metavar="S", help="With --show: time for each frame, without keys.", min=0),
+        Option(metavar="SECONDS", help="With --show: time for each frame, without keys.", min=0),
     ] = None,
     windowed: Windowed = False,
-    seed: Annotated[int, Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
+    seed: Annotated[int, seed_option("Seed of the dots' codes.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Make frames of dots for `calibrate geometric`: each dot blinks its own code.
@@ -71,7 +73,6 @@ def dots(
     """
     import numpy as np
 
-    from hilstar.instruments.calibrate.geometric.calibration import seen_screen_of
     from hilstar.instruments.calibrate.geometric.dots import (
         dot_image,
         lit_for,
@@ -79,6 +80,7 @@ def dots(
         show_dots,
         write_plan,
     )
+    from hilstar.instruments.calibrate.geometric.geometry_fit import seen_screen_of
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.frame_files import write_codes_png
 
@@ -99,7 +101,7 @@ def dots(
         write_codes_png(output / f"frame_{frame:03}.png", image, monitor.bits)
     shown = None
     if show:
-        shown = show_dots(plan, monitor, seconds, windowed=windowed)
+        shown = show_dots(plan, monitor, dwell, windowed=windowed)
         say(f"{shown} of {plan.frames} frames shown")
     summary = {
         "frames": plan.frames,
@@ -116,17 +118,21 @@ def dots(
 
 def geometric(
     bench_file: BenchFile,
-    observed: Annotated[
-        list[Path],
-        Argument(
-            metavar="OBSERVED...",
-            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.",
-        ),
-    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
     output: Annotated[
         Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
     ],
+    observed: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="OBSERVED...",
+            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images; none with --grab.",
+        ),
+    ] = None,
+    grab: Grab = None,
+    exposure: Exposure = None,
+    feed: ShownTo = None,
+    overwrite: Overwrite = False,
     tracker_is_ideal: Annotated[
         bool,
         Option(
@@ -135,7 +141,11 @@ def geometric(
         ),
     ] = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="A dark frame, taken from each image; with --grab one is taken, too.",
+        ),
     ] = None,
     plot: Annotated[
         Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")
@@ -145,7 +155,7 @@ def geometric(
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker
     saw.
     """
-    from hilstar.instruments.calibrate.geometric.calibration import (
+    from hilstar.instruments.calibrate.geometric.geometry_fit import (
         calibrate_files,
         lines_of,
         summary_of,
@@ -156,10 +166,13 @@ def geometric(
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
-    check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
-    calibration = calibrate_files(
-        file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
-    )
+    check_files([*(observed or []), dark, plan / "plan.csv"], [output, plot], file)
+    taken = dot_images(file, observed or [], plan, grab, exposure, feed, overwrite)
+    dark = dark or taken.dark
+    with busy("fitting the geometry"):
+        calibration = calibrate_files(
+            file, taken.images, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
+        )
     monitor = file.config.monitor
     written = write_calibrated(
         output, calibration, plot, _monitor_of(monitor.display, monitor.resolution_px)
@@ -173,19 +186,28 @@ def geometric(
 
 def psf(
     bench_file: BenchFile,
-    images: Annotated[
-        list[Path], Argument(metavar="IMAGES...", help="The tracker's images of the dots.")
-    ],
     plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
     output: Annotated[
         Path,
         Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf."),
     ],
+    images: Annotated[
+        list[Path] | None,
+        Argument(metavar="IMAGES...", help="The tracker's images of the dots; none with --grab."),
+    ] = None,
+    grab: Grab = None,
+    exposure: Exposure = None,
+    feed: ShownTo = None,
+    overwrite: Overwrite = False,
     dark: Annotated[
-        Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="A dark frame, taken from each image; with --grab one is taken, too.",
+        ),
     ] = None,
     oversampling: Annotated[
-        int, Option(help="Samples a tracker pixel along each axis.", min=2, max=16)
+        int, Option(metavar="N", help="Samples a tracker pixel along each axis.", min=2, max=16)
     ] = 4,
     plot: Annotated[Path | None, Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
     as_json: Json = False,
@@ -205,8 +227,11 @@ def psf(
     check_ending("-o", output, FITS)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
-    check_files([*images, dark, plan / "plan.csv"], [output, plot], file)
-    psf_result = effective_psf(file, images, plan / "plan.csv", dark, oversampling)
+    check_files([*(images or []), dark, plan / "plan.csv"], [output, plot], file)
+    taken = dot_images(file, images or [], plan, grab, exposure, feed, overwrite)
+    dark = dark or taken.dark
+    with busy("finding the PSFs"):
+        psf_result = effective_psf(file, taken.images, plan / "plan.csv", dark, oversampling)
     write_glass(output, psf_result.glass)
     if plot is not None:
         draw_effective(plot, psf_result)
@@ -269,7 +294,9 @@ def alignment(
     offset_s: Annotated[
         float | None,
         Option(
-            "--offset-s", help="With --ledger: seconds to add to the telemetry's t_s; 0 by default."
+            "--offset-s",
+            metavar="SECONDS",
+            help="With --ledger: seconds to add to the telemetry's t_s; 0 by default.",
         ),
     ] = None,
     as_json: Json = False,
@@ -297,7 +324,8 @@ def alignment(
         )
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
-    aligned = align_files(file, pairs, ledger, offset_s or 0.0)
+    with busy("fitting the alignment"):
+        aligned = align_files(file, pairs, ledger, offset_s or 0.0)
     monitor = file.config.monitor
     write_alignment(output, aligned, file, _monitor_of(monitor.display, monitor.resolution_px))
     print_found(
@@ -311,15 +339,20 @@ def plan(
     output: Annotated[
         Path, Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")
     ],
-    bits: Annotated[int, Option(help="Bits per code.", min=1, max=16)] = 8,
+    bits: Annotated[int, Option(metavar="N", help="Bits per code.", min=1, max=16)] = 8,
     levels: Annotated[
-        int, Option(help="Levels from black to white; half of white is added.", min=2)
+        int, Option(metavar="N", help="Levels from black to white; half of white is added.", min=2)
     ] = 32,
     repeats: Annotated[
-        int, Option(help="Repeats of each level; 3 are enough for a plain power law.", min=1)
+        int,
+        Option(
+            metavar="N", help="Repeats of each level; 3 are enough for a plain power law.", min=1
+        ),
     ] = 6,
-    channels: Annotated[str, Option(help="Channels to measure, of w, r, g, b.")] = "w",
-    seed: Annotated[int, Option(help="Seed of the order.", min=0, max=MAX_SEED)] = 0,
+    channels: Annotated[
+        str, Option(metavar="wrgb", help="Channels to measure, of w, r, g, b.")
+    ] = "w",
+    seed: Annotated[int, seed_option("Seed of the order.")] = 0,
     headless: Annotated[
         Path | None, Option(metavar="DIR", help="Write the patches to this directory as PNG.")
     ] = None,
@@ -328,9 +361,9 @@ def plan(
         bool, Option("--show", help="Show the patches on a display: space for the next, q to quit.")
     ] = False,
     display: Annotated[str, Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
-    seconds: Annotated[
+    dwell: Annotated[
         float | None,
-        Option(metavar="S", help="With --show: time for each patch, without keys.", min=0),
+        Option(metavar="SECONDS", help="With --show: time for each patch, without keys.", min=0),
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
@@ -374,9 +407,7 @@ def plan(
     }
     print_found(as_json, summary, [line, advice])
     if show:
-        shown = show_patches(
-            planned, bits, int(display) if display.isdecimal() else display, seconds
-        )
+        shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, dwell)
         say(f"{shown} of {len(planned)} patches shown")
     elif headless is None:
         say(
@@ -394,12 +425,19 @@ def photometric(
         Path, Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")
     ],
     bits: Annotated[
-        int | None, Option(help="Bits per code; by default from the codes measured.", min=1, max=16)
+        int | None,
+        Option(
+            metavar="N", help="Bits per code; by default from the codes measured.", min=1, max=16
+        ),
     ] = None,
-    who: Annotated[str, Option(help="Who made the measurements.")] = "",
-    when: Annotated[str, Option(help="Date of the measurements; today by default.")] = "",
-    instrument: Annotated[str, Option(help="Instrument used.")] = "",
-    unit: Annotated[str, Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
+    who: Annotated[str, Option(metavar="NAME", help="Who made the measurements.")] = "",
+    when: Annotated[
+        str, Option(metavar="DATE", help="Date of the measurements; today by default.")
+    ] = "",
+    instrument: Annotated[str, Option(metavar="NAME", help="Instrument used.")] = "",
+    unit: Annotated[
+        str, Option(metavar="UNIT", help="Unit of the values, such as cd/m2 or DN.")
+    ] = "",
     plot: Annotated[
         Path | None, Option(metavar="OUT.png", help="The response and its residuals.")
     ] = None,
@@ -423,9 +461,9 @@ def photometric(
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
     identity = _monitor_of(int(display) if display.isdecimal() else display)
-    found = calibrate_photometric(
-        measured, output, Provenance(who, when, instrument, unit), bits, identity
-    )
+    provenance = Provenance(who, when, instrument, unit)
+    with busy("fitting the response"):
+        found = calibrate_photometric(measured, output, provenance, bits, identity)
     if plot is not None:
         draw_calibration(measured, plot, bits)
         found["written"].append(str(plot))
@@ -478,7 +516,7 @@ def scale(
     ],
     exposure: Annotated[
         float | None,
-        Option(metavar="S", help="The tracker's exposure; by default the bench file's."),
+        Option(metavar="SECONDS", help="The tracker's exposure; by default the bench file's."),
     ] = None,
     output: Annotated[
         Path | None,

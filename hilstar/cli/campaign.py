@@ -45,7 +45,9 @@ def campaign(
     ],
     workers: Annotated[
         int | None,
-        Option(help="Processes on this machine; by default one a core.", min=1, max=1024),
+        Option(
+            metavar="N", help="Processes on this machine; by default one a core.", min=1, max=1024
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -78,7 +80,7 @@ def campaign(
         ),
     ] = CENTROIDS,
     solver_timeout: Annotated[
-        float, Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)
+        float, Option(metavar="SECONDS", help="Time limit of one image, s.", min=0.01, max=86400)
     ] = 10.0,
     images: Annotated[
         Literal["fits"] | None, Option(help="Keep the images, with their truth.")
@@ -93,9 +95,7 @@ def campaign(
     headless: Headless = False,
     windowed: running.Windowed = False,
     force: running.Force = False,
-    frames: Annotated[
-        str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")
-    ] = None,
+    feed: running.Feed = None,
     console: running.Console = None,
     token: running.Token = None,
     console_name: running.ConsoleName = None,
@@ -134,7 +134,7 @@ def campaign(
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, solver, solver_timeout, images is not None)
     of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
-    of_bench |= {"--frames": frames is not None, "--console": console is not None}
+    of_bench |= {"--feed": feed is not None, "--console": console is not None}
     _check_options(this.on_bench, of_bench, pooled)
     directory = Directory(output)
     try:
@@ -144,7 +144,7 @@ def campaign(
                 running.shown_bench, headless=headless, windowed=windowed, force=force, timed=True
             )
             with running.page_listener(console, False, token, console_name) as listener:
-                show_cases(this, directory, shown_bench, frames, listener)
+                show_cases(this, directory, shown_bench, feed, listener)
         elif not directory.table.exists():
             run_cases(
                 this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes
@@ -191,7 +191,7 @@ def show_cases(
     this: "Campaign",
     directory: "Directory",
     shown_bench: Callable[["BenchFile"], AbstractContextManager[tuple[Any, Any]]],
-    frames: str | None,
+    endpoint: str | None,
     listener: "PageListener | None",
 ) -> None:
     """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
@@ -225,7 +225,7 @@ def show_cases(
         def display(file: "BenchFile") -> Iterator[OpenDisplay]:
             with (
                 shown_bench(file) as (bench, screen),
-                running.optional_frames(frames, bench, screen) as feed,
+                running.optional_frames(endpoint, bench, screen) as feed,
             ):
                 ledger = LedgerSwitch()
                 renderer = bench.renderer.gl_renderer

@@ -8,7 +8,7 @@ from typer import Option
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.files import STDOUT, check_outputs
 from hilstar.cli.options import BenchFile, Json
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 
 def catalogue(
@@ -22,9 +22,11 @@ def catalogue(
             help="The table; its ending says what it is.",
         ),
     ],
-    to: Annotated[
+    faintest: Annotated[
         float | None,
-        Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40),
+        Option(
+            "--faintest", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40
+        ),
     ] = None,
     epoch: Annotated[
         float | None,
@@ -51,8 +53,9 @@ def catalogue(
         )
     check_outputs([bench_file], [output])
     file = read_bench_file(bench_file)
-    bench_stars = bench_catalogue(file, to, epoch)
-    write_catalogue(output, bench_stars)
+    with busy("computing the catalogue"):
+        bench_stars = bench_catalogue(file, faintest, epoch)
+        write_catalogue(output, bench_stars)
     fields = {
         "file": str(output),
         "stars": len(bench_stars),

@@ -12,9 +12,9 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory, write_whole
 from hilstar.basics.reading import exists
-from hilstar.cli.image_source import image_source, virtual_truth
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.server.console.terminal import print_found, say
+from hilstar.cli.image_source import ShownTo, handed_on, image_source, virtual_truth
+from hilstar.cli.options import BenchFile, Json, check_files, seed_option
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.instruments.certify.readings import Reader
@@ -41,10 +41,10 @@ def certify(
     grab: Annotated[
         str | None,
         Option(
-            metavar="CMD",
+            metavar="CMD|genicam:NAME",
             help=(
                 "Command that takes the tracker's image, as that of first-light ({output},"
-                " {pattern})."
+                " {pattern}), or a camera."
             ),
         ),
     ] = None,
@@ -79,18 +79,17 @@ def certify(
         float,
         Option(
             "--warm-up",
-            metavar="MIN",
+            metavar="MINUTES",
             min=0,
             max=240,
             help="Watch white for up to so long, until it is stable.",
         ),
     ] = 0.0,
+    feed: ShownTo = None,
     quick: Annotated[
         bool, Option("--quick", help="Few trials: first order is enough where the model is linear.")
     ] = False,
-    seed: Annotated[
-        int, Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)
-    ] = 0,
+    seed: Annotated[int, seed_option("With --virtual: seed of the readings' noise.")] = 0,
     as_json: Json = False,
 ) -> None:
     """State how sure a bench is: the light, places, attitude and latency of stars, with the
@@ -110,6 +109,7 @@ def certify(
         ("--whole", whole or None),
         ("--dark", dark),
         ("--diode", diode),
+        ("--feed", feed),
     ):
         if given is not None and (virtual is not None) != (name == "--whole"):
             raise InputError(
@@ -130,6 +130,7 @@ def certify(
             whole,
             dark,
             diode,
+            feed,
             seed,
             check,
             again,
@@ -154,7 +155,7 @@ def _certify(
     from hilstar.instruments.certify.certificate import certify as certified
     from hilstar.instruments.certify.check import largest_changes, watch
     from hilstar.instruments.certify.page import text_lines, write_certificate_page
-    from hilstar.server.bench.certificate import read_certificate
+    from hilstar.server.bench.certificate_file import read_certificate
 
     path = output / CERTIFICATE
     replaces = None
@@ -171,9 +172,10 @@ def _certify(
         say(watched.line)
         warmed = None if watched.law == "none" else watched.bound
     checked = largest_changes(output)
-    certificate, reference = certified(
-        file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces
-    )
+    with busy("certifying"):
+        certificate, reference = certified(
+            file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces
+        )
     raw = msgspec.json.format(msgspec.json.encode(certificate))
     digest = sha256_of(raw)
     if reference is not None:
@@ -204,7 +206,7 @@ def _check(
         take_check,
         watch,
     )
-    from hilstar.server.bench.certificate import read_certificate
+    from hilstar.server.bench.certificate_file import read_certificate
 
     reference = read_reference(output / REFERENCE)
     since = "the bench file"
@@ -254,6 +256,7 @@ def _reader(
     whole: bool,
     dark: Path | None,
     diode: str | None,
+    feed: str | None,
     seed: int,
     check: bool,
     again: bool,
@@ -272,6 +275,7 @@ def _reader(
     if truth is not None and not whole:
         return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
     source = ended.enter_context(closing(image_source(file, grab, virtual, dark, diode, seed)))
+    ended.enter_context(handed_on(feed, source))
     source.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
     source.gate(file)
     folder = ended.enter_context(temporary_folder("certify"))

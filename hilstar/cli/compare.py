@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli.options import Json
-from hilstar.server.console.terminal import print_json
+from hilstar.server.console.terminal import busy, print_json
 
 MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothing
 
@@ -25,10 +25,11 @@ def compare(
         Path | None, Option(metavar="TRUTH.csv", help="B's stars, from `hilstar frame --truth`.")
     ] = None,
     flux_mag: Annotated[
-        float | None, Option(help="Largest flux error of a star; 0.001 by default.")
+        float | None, Option(metavar="MAG", help="Largest flux error of a star; 0.001 by default.")
     ] = None,
     centroid_px: Annotated[
-        float | None, Option(help="Largest centroid error of a star; 0.001 by default.")
+        float | None,
+        Option(metavar="PX", help="Largest centroid error of a star; 0.001 by default."),
     ] = None,
     output: Annotated[
         Path | None,
@@ -46,11 +47,12 @@ def compare(
         FLUX_MAG if flux_mag is None else flux_mag,
         CENTROID_PX if centroid_px is None else centroid_px,
     )
-    comparison = compare_files(
-        frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth
-    )
-    if output is not None:
-        write_report(make_directory(output), comparison)
+    with busy("comparing"):
+        comparison = compare_files(
+            frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth
+        )
+        if output is not None:
+            write_report(make_directory(output), comparison)
     summary = comparison.summary()
     if as_json:
         print_json(summary)

@@ -6,30 +6,49 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory
+from hilstar.cli.image_source import Exposure, photographs
 from hilstar.cli.options import (
     BenchFile,
     Json,
-    QuaternionText,
-    RadecText,
     check_files,
-    parse_attitude,
 )
+from hilstar.cli.pointing import QuaternionText, RadecText, StarText, optional_attitude
 from hilstar.server.console.terminal import print_found, say
+
+IMAGES, USUAL_COUNT = "images", 5
 
 
 def confront(
     bench_file: BenchFile,
-    images: Annotated[
-        list[Path],
-        Argument(metavar="IMAGE...", help="Raw frames: FITS, TIFF or PNG, 8 to 16 bits."),
-    ],
     output: Annotated[
         Path,
         Option(
             "-o", "--output", metavar="DIR", help="Directory for the page, tracker.toml, tables."
         ),
     ],
+    images: Annotated[
+        list[Path] | None,
+        Argument(
+            metavar="IMAGE...",
+            help="Raw frames: FITS, TIFF or PNG, 8 to 16 bits; none with --grab.",
+        ),
+    ] = None,
+    grab: Annotated[
+        str | None,
+        Option(
+            metavar="CMD|genicam:NAME",
+            help=(
+                "Take the images now, into DIR/images: a command ({output}, {exposure_s}), or a"
+                " camera."
+            ),
+        ),
+    ] = None,
+    count: Annotated[
+        int | None, Option(metavar="N", help="With --grab: how many. [5]", min=1, max=1000)
+    ] = None,
+    exposure: Exposure = None,
     fixed: Annotated[
         bool,
         Option(
@@ -38,10 +57,13 @@ def confront(
         ),
     ] = False,
     radec: RadecText = None,
+    star: StarText = None,
     quaternion: QuaternionText = None,
-    at: Annotated[
+    taken: Annotated[
         str | None,
-        Option("--at", metavar="UTC", help="When the images were taken, where they do not say it."),
+        Option(
+            "--taken", metavar="UTC", help="When the images were taken, where they do not say it."
+        ),
     ] = None,
     as_json: Json = False,
     strict: Annotated[
@@ -51,23 +73,31 @@ def confront(
     """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts
     against them.
     """
-    from hilstar.instruments.confront.files import read_tracker_file
     from hilstar.instruments.confront.images import parse_utc
+    from hilstar.instruments.confront.measured_bench import read_tracker_file
     from hilstar.instruments.confront.run import OUTPUTS
     from hilstar.instruments.confront.run import confront as confront_files
     from hilstar.server.bench.bench_file import BenchFile as ReadFile
 
     check_directory("-o", output)
-    if radec is None and quaternion is None:
-        start = None
-    else:
-        start = parse_attitude("confront", radec, quaternion)
-    at_ns = None if at is None else parse_utc(at)
+    at_ns = None if taken is None else parse_utc(taken)
     file: ReadFile = read_tracker_file(bench_file)[0]
-    check_files(images, [output / name for name in OUTPUTS], file)
+    epoch_jyear = file.config.sky.epoch_jyear
+    start = optional_attitude("confront", radec, star, quaternion, epoch_jyear)
+    given = images or []
+    check_files(given, [output / name for name in OUTPUTS], file)
+    if grab is not None:
+        if given:
+            raise InputError(f"{given[0]}: --grab takes the images; leave one of them out")
+        given = photographs(file, grab, count or USUAL_COUNT, exposure, output / IMAGES)
+    for name, value in (("--count", count), ("--exposure", exposure)):
+        if grab is None and value is not None:
+            raise InputError(f"{name}: is for --grab; write --grab, or leave it out")
+    if not given:
+        raise InputError("confront: no image; give files, or --grab to take them")
     tell = (lambda line: None) if as_json else typer.echo
     confronted = confront_files(
-        bench_file, images, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell
+        bench_file, given, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell
     )
     print_found(as_json, confronted.figures, [*confronted.lines, f"page: {output / 'index.html'}"])
     for note in (*confronted.notes, *confronted.failures):

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument
 
+from hilstar.basics.units import NS_PER_S
 from hilstar.cli import options
-from hilstar.server.console.terminal import say
+from hilstar.server.console.terminal import print_found, say
 
 
 @options.log_statements
@@ -15,6 +15,7 @@ def convert(
     log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
     output: Annotated[Path, Argument(metavar="OUT", help=".csv, .jsonl, .aem, .xml or .mcap.")],
     statements: options.LogStatements = options.NOTHING_STATED,
+    as_json: options.Json = False,
 ) -> None:
     """Convert an attitude log to another format."""
     from hilstar.attitude.clock.resolution import coarse_lines
@@ -22,10 +23,18 @@ def convert(
 
     options.check_files([log], [output])
     read = open_log(log, statements.stated())
-    for _, line in [*read.told, *coarse_lines(read.samples)]:
-        say(line)
+    notes = [line for _, line in [*read.told, *coarse_lines(read.samples)]]
     doubt = read.joins().doubt
     if doubt:
-        say(doubt)
+        notes.append(doubt)
+    for line in notes:
+        say(line)
     write_log(output, read.samples, read.conventions.scale)
-    typer.echo(f"{len(read.samples)} attitudes in {output}")
+    fields = {
+        "attitudes": len(read.samples),
+        "duration_s": (read.samples[-1].t_ns - read.samples[0].t_ns) / NS_PER_S,
+        "source": read.conventions.source,
+        "notes": notes,
+        "written": [str(output)],
+    }
+    print_found(as_json, fields, [f"{len(read.samples)} attitudes in {output}"])

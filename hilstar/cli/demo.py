@@ -16,7 +16,7 @@ from hilstar.basics.files import check_directory, make_directory, temporary_fold
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import caught
 from hilstar.cli import running
-from hilstar.cli.options import MAX_SEED, Json
+from hilstar.cli.options import Json, seed_option
 from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.console.terminal import progress, report, say
 
@@ -45,12 +45,17 @@ PLANTED += ["--wrong", str(WRONG)]
 
 
 def demo(
-    output: Annotated[Path, Option("-o", "--output", help="Directory for the pictures.")] = Path(
-        "hilstar-demo"
-    ),
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="DIR", help="Directory for the pictures.")
+    ] = Path("hilstar-demo"),
     duration: Annotated[
         float | None,
-        Option(help="Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600),
+        Option(
+            metavar="SECONDS",
+            help="Seconds to run; by default 10, and 60 with --loop.",
+            min=0.5,
+            max=600,
+        ),
     ] = None,
     loop: Annotated[
         bool,
@@ -59,9 +64,7 @@ def demo(
             help="A slow scan with a virtual tracker before the display, and its error budget.",
         ),
     ] = False,
-    seed: Annotated[
-        int, Option(help="Seed of the jitter, and of the tracker's errors.", min=0, max=MAX_SEED)
-    ] = 1,
+    seed: Annotated[int, seed_option("Seed of the jitter, and of the tracker's errors.")] = 1,
     console: running.Console = None,
     control: running.Control = False,
     token: running.Token = None,

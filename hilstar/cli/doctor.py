@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from hilstar.cli.options import Json
 from hilstar.cli.running import say_units
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found, print_json, print_states
 
 OwnBench = Annotated[
     Path | None,
@@ -42,8 +42,9 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
         cells = row()
         print_found(as_json, cells, [table(cells)])
         return
-    benches = examine_bench(bench_file, datetime.now(UTC).date())
-    result = examine()
+    with busy("examining this machine"):
+        benches = examine_bench(bench_file, datetime.now(UTC).date())
+        result = examine()
     for bench in benches.values():
         say_units(bench.fields)  # a star that is too wide is on the page, with its panels
     if benches:
@@ -53,7 +54,10 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
     lines = [check.line() for check in result.checks]
     lines += [line for output in result.outputs for line in output.lines()]
     lines += [line for name, bench in benches.items() for line in bench.lines(name)]
-    print_found(as_json, asdict(result) | named, lines)
+    if as_json:
+        print_json(asdict(result) | named)
+    else:
+        print_states(lines)
     if not result.ok:
         raise typer.Exit(3)
     for bench in benches.values():

@@ -20,6 +20,7 @@ from hilstar.basics.process import interrupts
 from hilstar.basics.process.interrupts import finish_stderr, queue_stderr
 from hilstar.basics.reading import add_kinds, exists
 from hilstar.cli.app import EarlyEnd, run
+from hilstar.cli.old_names import with_present_names
 from hilstar.cli.options import with_values
 from hilstar.server.console.terminal import fail
 
@@ -29,8 +30,9 @@ LOG_FORMAT = "hilstar: %(message)s"
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1
 INPUT_ENDINGS = (".toml", ".mcap", ".csv", ".json", ".jsonl", ".fits", ".png", ".aem")
 # several numbers, with commas
-NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+NUMBER_OPTIONS = ("--radec", "--quaternion", "--slew", "--place", "--mounting", "--reading")
+# degrees, or sexagesimal
+NUMBER = r"[-+]?(?:\d[\d.:hdms]*|\.\d+)(?:[eE][-+]?\d+)?"
 # a word that a shell makes of numbers with spaces between them
 NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")
 ELSEWHERE = dict.fromkeys(
@@ -63,16 +65,17 @@ def run_command(words: list[str]) -> int:
     stderr.
     """
     add_kinds(_kinds_of_logs)
+    words = with_values(with_present_names(words))
     try:
         if not writes_to_stdout(words):
-            return _run(with_values(words))
+            return _run(words)
         if "--json" in words:
             fail(
                 "--json and an output to -: both are for stdout; give a name for the output",
                 InputError.exit_code,
             )
         with contextlib.redirect_stdout(sys.stderr):  # stdout is the file's alone
-            return _run(with_values(words))
+            return _run(words)
     except SystemExit as end:  # raised by `fail`
         return end.code if isinstance(end.code, int) else 1
 

@@ -1,6 +1,6 @@
 """hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,24 +12,31 @@ from typer import Option
 
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.image_source import image_source, virtual_truth
+from hilstar.cli.completion import offered
+from hilstar.cli.image_source import handed_on, image_source, virtual_truth
 from hilstar.cli.options import (
-    MAX_SEED,
     BenchFile,
     Json,
     check_files,
-    frames_of,
+    seed_option,
 )
-from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
+from hilstar.cli.running import Console, ConsoleName, Control, Feed, Force, Token, page_listener
 from hilstar.server.console.terminal import print_found, say
 
 if TYPE_CHECKING:
-    from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern
+    from hilstar.instruments.calibrate.first_light.image_sources import Pattern
     from hilstar.server.bench import bench_file as files
     from hilstar.server.console.listener import PageListener
 
 PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
-MAX_FRAMES = 1000  # images that verify averages
+MAX_AVERAGE = 1000  # images that verify averages
+
+
+def steps() -> Iterable[str]:
+    """The steps that --again takes."""
+    from hilstar.instruments.calibrate.first_light.session import NAMES
+
+    return NAMES
 
 
 def first_light(
@@ -40,7 +47,7 @@ def first_light(
             "-o",
             "--output",
             metavar="SESSION",
-            help="Directory of the session; an older one is gone on with.",
+            help="Directory of the session; an existing session is resumed.",
         ),
     ],
     grab: Annotated[
@@ -102,23 +109,28 @@ def first_light(
             max=1440,
         ),
     ] = None,
-    frames: Annotated[
-        list[str] | None,
+    average: Annotated[
+        int | None,
         Option(
-            metavar="N|ENDPOINT",
+            metavar="N",
             help=(
                 "Images of each field of stars that verify averages [as many as their noise asks"
-                " for, 25 at most; by hand 1]. With an endpoint such as tcp://127.0.0.1:5570 it"
-                " hands each pattern on to who watches there; may be given once for each."
+                " for, 25 at most; by hand 1]."
             ),
+            min=1,
+            max=MAX_AVERAGE,
         ),
     ] = None,
+    feed: Feed = None,
     again: Annotated[
-        list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")
+        list[str] | None,
+        Option(
+            metavar="STEP",
+            help="Do this step again; may be given often.",
+            autocompletion=offered(steps),
+        ),
     ] = None,
-    seed: Annotated[
-        int, Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)
-    ] = 0,
+    seed: Annotated[int, seed_option("With --virtual: seed of the tracker's noise.")] = 0,
     force: Force = False,
     console: Console = None,
     control: Control = False,
@@ -151,9 +163,6 @@ def first_light(
     file = read_bench_file(bench_file)
     virtual = virtual_truth(virtual)
     check_files([virtual, dark], [], file)
-    count, endpoint = frames_of(frames, heads=False)
-    if count is not None and count > MAX_FRAMES:
-        raise InputError(f"--frames {count}: write at most {MAX_FRAMES}")
     by_hand = grab is None and virtual is None
     if patches is None:
         readings = 0 if by_hand else PATCHES
@@ -170,7 +179,7 @@ def first_light(
     with (
         page_listener(console, control, token, console_name) as listener,
         closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
-        _handed_on(endpoint, source),
+        handed_on(feed, source),
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -184,7 +193,7 @@ def first_light(
             readings,
             watch,
             watched_s=watched_s,
-            frames=count or 0,
+            frames=average or 0,
             progress=say,
         )
         code = session.run(frozenset(again or []), tell)
@@ -222,18 +231,3 @@ def _shown(
             feed.say(line)
 
         yield tell, feed.show
-
-
-@contextmanager
-def _handed_on(endpoint: str | None, source: "ImageSource") -> Iterator[None]:
-    """The session's patterns handed on at an endpoint, if there is one. Raises InputError."""
-    if endpoint is None:
-        yield
-        return
-    from hilstar.attitude.wire.shown_frames import FrameSender
-    from hilstar.instruments.calibrate.first_light.image_sources import PatternFrames
-
-    with FrameSender(endpoint) as sender:
-        source.hand_on(PatternFrames(sender))
-        say(f"frames: {sender.endpoint}")
-        yield

@@ -7,15 +7,14 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Option
 
 from hilstar import server
 from hilstar.attitude.wire import protocol
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import check_ending, temporary_folder, written
-from hilstar.cli.options import BenchFile, check_files
-from hilstar.server.console.terminal import say
+from hilstar.cli.options import BenchFile, Json, check_files
+from hilstar.server.console.terminal import busy, print_found, say
 
 FMU = (".fmu",)
 # the modules in the FMU: the model, and the table of the wire that it imports
@@ -26,6 +25,7 @@ EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
 def fmu(
     bench_file: BenchFile,
     output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")],
+    as_json: Json = False,
 ) -> None:
     """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and
     answered attitude out.
@@ -36,10 +36,10 @@ def fmu(
     file = read_bench_file(bench_file)
     check_files([], [output], file)
     address = _address(file.path, file.config.attitude)
-    with temporary_folder("fmu") as folder:
+    with busy("building the FMU"), temporary_folder("fmu") as folder:
         written(output, lambda out: out.write(build(folder, address).read_bytes()))
     say(f"{output}: sends to {address}; start hilstar serve {bench_file} there")
-    typer.echo(str(output))
+    print_found(as_json, {"address": address, "written": [str(output)]}, [str(output)])
 
 
 def _address(path: Path, settings: object) -> str:

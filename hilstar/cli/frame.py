@@ -8,8 +8,9 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import CSV, FITS, PNG, check_ending
 from hilstar.cli import options
+from hilstar.cli.pointing import QuaternionText, RadecText, StarText, attitude_of
 from hilstar.cli.running import explain_bench, explained_effort, optional_scenario, say_optics
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 NO_OUTPUT = (
     "frame: no output was asked for; add -o OUT.fits, --truth OUT.csv, --codes OUT.png or --explain"
@@ -18,8 +19,9 @@ NO_OUTPUT = (
 
 def frame(
     bench_file: options.BenchFile,
-    radec: options.RadecText = None,
-    quaternion: options.QuaternionText = None,
+    radec: RadecText = None,
+    star: StarText = None,
+    quaternion: QuaternionText = None,
     output: Annotated[
         Path | None,
         Option(
@@ -50,7 +52,7 @@ def frame(
     from hilstar.server.bench.star_size import star_size
 
     file = read_bench_file(bench_file)
-    q = options.parse_attitude("frame", radec, quaternion)
+    q = attitude_of("frame", radec, star, quaternion, file.config.sky.epoch_jyear)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
     _check_targets(output, truth, codes, preview, explain)
     t_ns, wrong = (
@@ -60,7 +62,7 @@ def frame(
     file = at_moment(file, t_ns)
     options.check_files([scenario], targets, file)
     fields = fields_of_view(file.config, file.folder)
-    with open_bench(file) as bench:
+    with busy("drawing"), open_bench(file) as bench:
         if explain:
             explain_bench(bench, t_ns)
         effects = None
@@ -79,7 +81,7 @@ def frame(
         if preview is not None:
             files.write_preview_png(preview, shot.levels)
         clipped = clipped_in(shot.rows)
-        star = star_size(file.config, file.folder, bench.camera)
+        seen_star = star_size(file.config, file.folder, bench.camera)
         summary: dict[str, Any] = {
             "stars": len(shot.rows),
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
@@ -91,7 +93,7 @@ def frame(
             "faults": [] if effects is None else [active.fault.name for active in effects.now],
             "written": [str(path) for path in targets],
             "fields_of_view": fields.keys(),
-            "star": star.keys(),
+            "star": seen_star.keys(),
             "gl_renderer": bench.renderer.gl_renderer,
         }
         summary |= explained_effort(bench, explain and as_json)
@@ -106,8 +108,8 @@ def frame(
     drawn = f"{len(shot.rows)} stars{names}"
     if targets:
         drawn += f"; wrote {', '.join(summary['written'])}"
-    print_found(as_json, summary, [drawn, fields.line(), star.line()])
-    say_optics(fields, star)  # after the refusals: a failing command prints one line
+    print_found(as_json, summary, [drawn, fields.line(), seen_star.line()])
+    say_optics(fields, seen_star)  # after the refusals: a failing command prints one line
 
 
 def _check_targets(

@@ -9,7 +9,7 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import CSV, check_directory, check_ending
 from hilstar.cli.options import Json, Overwrite, RunFile, check_files, parse_diode
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 LEDGER_BEHIND_S = 0.5  # the newest part of a running ledger may not be on the disk yet
 
@@ -26,7 +26,7 @@ def latency(
         ),
     ] = None,
     duration: Annotated[
-        float, Option(help="How long to read edges, in seconds.", min=0.5, max=3600)
+        float, Option(metavar="SECONDS", help="How long to read edges.", min=0.5, max=3600)
     ] = 10.0,
     save: Annotated[
         Path | None, Option(metavar="EDGES.csv", help="Save the edges that were read.")
@@ -62,7 +62,8 @@ def latency(
     if diode is None:
         edges_read = by_diode.read_edges(edges or Path())
     else:
-        edges_read = by_diode.capture_edges(*parse_diode(diode), duration)
+        with busy(f"reading edges for {duration:g} s"):
+            edges_read = by_diode.capture_edges(*parse_diode(diode), duration)
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         by_diode.save_edges(save, edges_read)

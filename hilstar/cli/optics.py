@@ -11,7 +11,7 @@ from typer import Argument, Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import FITS, check_ending
 from hilstar.cli.options import Json, check_files, parse_numbers
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.optics.glass.psf_file import Glass
@@ -21,11 +21,16 @@ Output = Annotated[
     Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")
 ]
 Oversampling = Annotated[
-    int, Option(help="Samples a tracker pixel along each axis.", min=1, max=64)
+    int, Option(metavar="N", help="Samples a tracker pixel along each axis.", min=1, max=64)
 ]
 Tolerance = Annotated[
     float,
-    Option(help="Share of a PSF's light that the file's basis may put elsewhere.", min=0, max=0.1),
+    Option(
+        metavar="SHARE",
+        help="Share of a PSF's light that the file's basis may put elsewhere.",
+        min=0,
+        max=0.1,
+    ),
 ]
 
 
@@ -57,7 +62,9 @@ def map_(
 
     check_ending("-o", output, FITS)
     check_files([stack, points], [output])
-    _tell(output, glass_of_map(stack, points, oversampling, pixel_integrated, tolerance), as_json)
+    with busy("finding the basis"):
+        glass = glass_of_map(stack, points, oversampling, pixel_integrated, tolerance)
+    _tell(output, glass, as_json)
 
 
 def zernike(
@@ -71,6 +78,7 @@ def zernike(
     oversampling: Annotated[
         int | None,
         Option(
+            metavar="N",
             help="Samples a tracker pixel along each axis; by default as diffraction needs.",
             min=1,
             max=64,
@@ -86,7 +94,9 @@ def zernike(
 
     check_ending("-o", output, FITS)
     check_files([pupil], [output])
-    _tell(output, glass_of_pupil(pupil, oversampling, tolerance), as_json)
+    with busy("computing the PSFs"):
+        glass = glass_of_pupil(pupil, oversampling, tolerance)
+    _tell(output, glass, as_json)
 
 
 def lens(
@@ -107,6 +117,7 @@ def lens(
         float | None,
         Option(
             "--pitch-um",
+            metavar="UM",
             help="The tracker's pixel pitch, in place of the bench's.",
             min=0.1,
             max=1000,
@@ -125,11 +136,12 @@ def lens(
         ),
     ] = "0",
     half_px: Annotated[
-        int, Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)
+        int, Option("--half-px", metavar="PX", help="Half of a stamp's side, px.", min=1, max=100)
     ] = 8,
     oversampling: Annotated[
         int | None,
         Option(
+            metavar="N",
             help="Samples a tracker pixel along each axis; by default as diffraction needs.",
             min=1,
             max=64,
@@ -169,9 +181,9 @@ def lens(
         "--focuses-um",
         "--focuses-um in um, such as -20,0,20",
     )
-    glass = glass_of_prescription(
-        prescription, Plate(size, pitch_um, tuple(focuses), half_px), oversampling, tolerance
-    )
+    plate = Plate(size, pitch_um, tuple(focuses), half_px)
+    with busy("tracing the lens"):
+        glass = glass_of_prescription(prescription, plate, oversampling, tolerance)
     for note in glass.notes:
         say(f"{prescription}: {note}")
     facts: dict[str, Any] = {"focal_length_mm": glass.focal_length_mm, "f_number": glass.f_number}

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from typer import Argument, Option
 
-from hilstar.basics.errors import InputError, did_you_mean
+from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 from hilstar.basics.units import NS_PER_S
+from hilstar.cli.completion import offered
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
@@ -35,13 +36,6 @@ Json = Annotated[
     bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")
 ]
 Headless = Annotated[bool, Option("--headless", help="Draw without a window.")]
-RadecText = Annotated[
-    str | None,
-    Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS."),
-]
-QuaternionText = Annotated[
-    str | None, Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")
-]
 Overwrite = Annotated[
     bool, Option("--overwrite", help="Replace an existing file that could not be made again.")
 ]
@@ -55,7 +49,9 @@ Explain = Annotated[
 AtSeconds = Annotated[
     float | None,
     Option(
-        "--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default."
+        "--at",
+        metavar="SECONDS",
+        help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.",
     ),
 ]
 RunFile = Annotated[Path, Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
@@ -79,7 +75,15 @@ BodyName = Annotated[
     str | None, unsaid("--body", metavar="NAME", help="The body or frame, where a log has several.")
 ]
 REFERENCE_HELP = "The frame that attitudes refer to, or what its axes are: icrs, enu, ned."
-ReferenceName = Annotated[str | None, unsaid("--reference", metavar="FRAME", help=REFERENCE_HELP)]
+ReferenceName = Annotated[
+    str | None,
+    unsaid(
+        "--reference",
+        metavar="FRAME",
+        help=REFERENCE_HELP,
+        autocompletion=offered(("icrs", "enu", "ned")),
+    ),
+]
 EpochUtc = Annotated[
     str | None, unsaid("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.")
 ]
@@ -125,6 +129,18 @@ USUAL_ADDRESSES = {
 }
 
 
+def checked_seed(seed: int) -> int:
+    """The seed of an option. Raises InputError where it is too large."""
+    if seed > MAX_SEED:
+        raise InputError(f"--seed {shortened(str(seed))}: write 0 to {MAX_SEED}")
+    return seed
+
+
+def seed_option(meaning: str) -> Any:
+    """The option of a seed, a whole number from 0 to MAX_SEED."""
+    return Option(metavar="SEED", help=meaning, min=0, callback=checked_seed)
+
+
 def check_files(
     inputs: Iterable[Path | None],
     outputs: Iterable[Path | None],
@@ -167,40 +183,6 @@ def with_values(words: list[str]) -> list[str]:
     return complete
 
 
-def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str | None]:
-    """What --frames asks for: how many frames, and where they are sent to. Raises InputError."""
-    form = (
-        "write a number of frames, or an endpoint such as tcp://127.0.0.1:5570; both may be given"
-    )
-    counts = [text for text in asked or () if "://" not in text]
-    endpoints = [text for text in asked or () if "://" in text]
-    for kind in (counts, endpoints):
-        if len(kind) > 1:
-            raise InputError(f"--frames {kind[0]} and --frames {kind[1]}: {form}")
-    if counts and not (counts[0].isdecimal() and int(counts[0]) > 0):
-        raise InputError(f"--frames {counts[0]}: {form}")
-    if endpoints and heads:
-        raise InputError(
-            f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or"
-            " leave it out"
-        )
-    return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
-
-
-def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
-    """The one attitude that the command line gives."""
-    from hilstar.basics.rotation import from_radec_roll_deg
-    from hilstar.server.bench.frame import checked_quaternion
-
-    if (radec is None) == (quaternion is None):
-        raise InputError(
-            f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z"
-        )
-    if radec is not None:
-        return from_radec_roll_deg(*parse_radec(radec))
-    return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
-
-
 def parse_at(
     command: str, at_s: float | None, config: "BenchConfig", timed: bool = False
 ) -> int | None:
@@ -233,14 +215,6 @@ def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
     return numbers
-
-
-def parse_radec(text: str) -> tuple[float, float, float]:
-    """Right ascension, declination and roll in degrees."""
-    ra_deg, dec_deg, roll_deg = parse_numbers(text, 3, "--radec", "RA,DEC,ROLL in degrees")
-    if not -90 <= dec_deg <= 90:
-        raise InputError(f"--radec {text}: write a declination from -90 to 90")
-    return ra_deg, dec_deg, roll_deg
 
 
 def parse_spin(text: str) -> "FloatArray":

@@ -9,6 +9,7 @@ from typer import Argument, Option
 from hilstar.basics.files import MCAP, check_directory, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.cli import options, running
+from hilstar.cli.completion import offered
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.server.console.terminal import say
 
@@ -20,17 +21,22 @@ def replay(
     speed: Annotated[
         str,
         Option(
-            metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time."
+            metavar="realtime|max|N",
+            help="Real time, as fast as possible, or N times real time.",
+            autocompletion=offered(("realtime", "max")),
         ),
     ] = "realtime",
     start: Annotated[
-        float | None, Option(metavar="S", help="Start this many seconds after the first sample.")
+        float | None,
+        Option(metavar="SECONDS", help="Start this many seconds after the first sample."),
     ] = None,
     stop: Annotated[
-        float | None, Option(metavar="S", help="Stop this many seconds after the first sample.")
+        float | None,
+        Option(metavar="SECONDS", help="Stop this many seconds after the first sample."),
     ] = None,
     step: Annotated[
-        float | None, Option(metavar="S", help="Time step of the log between frames, in seconds.")
+        float | None,
+        Option(metavar="SECONDS", help="Time step of the log between frames, in seconds."),
     ] = None,
     statements: options.LogStatements = options.NOTHING_STATED,
     headless: options.Headless = False,
@@ -43,9 +49,7 @@ def replay(
             help="Directory for a PNG of each frame, and frames.csv.",
         ),
     ] = None,
-    frames: Annotated[
-        str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")
-    ] = None,
+    feed: running.Feed = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
     scenario: options.ScenarioFile = None,
@@ -97,7 +101,7 @@ def replay(
         running.optional_ledger(ledger, bench, notices, overwrite, split) as run_ledger,
         running.run_with_faults(bench, faults, notices, run_ledger, play.recording) as wrong,
         running.optional_answers(bench, notices, run_ledger, screen) as answers,
-        running.optional_frames(frames, bench, screen) as watched,
+        running.optional_frames(feed, bench, screen) as watched,
     ):
         if play.span:
             say(play.span)

@@ -7,7 +7,7 @@ from typer import Option
 
 from hilstar.basics.files import check_directory
 from hilstar.cli.options import Json, RunFile
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 
 def report(
@@ -22,9 +22,10 @@ def report(
     and memory.
     """
     from hilstar.server.console.report import report as write_report
-    from hilstar.server.record.report import table_rows
+    from hilstar.server.record.run_figures import table_rows
 
     check_directory("-o", output)
-    figures = write_report(ledger, output)
+    with busy("reading the run"):
+        figures = write_report(ledger, output)
     rows = [*table_rows(figures), ("page", output / "report.html")]
     print_found(as_json, figures, (f"{what:32}{how_much}" for what, how_much in rows))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hilstar.server.operator import SwitchRequests
     from hilstar.server.pacer import FrameSink, Shown
     from hilstar.server.record.ledger import LedgerSwitch
-    from hilstar.server.serve import Follower, Running
+    from hilstar.server.run_progress import Follower, Running
     from hilstar.server.summary import RunSummary
     from hilstar.server.sync import BeatSummary
 
@@ -123,19 +123,26 @@ ConsoleName = Annotated[
         help="A further name of the page, as a proxy shows it; may be given often.",
     ),
 ]
-FRAMES_HELP = (
-    "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar"
-    " tracker)"
-)
+Feed = Annotated[
+    str | None,
+    Option(
+        "--feed",
+        metavar="ENDPOINT",
+        help=(
+            "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570"
+            " (hilstar tracker)."
+        ),
+    ),
+]
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
     """Explain the attitudes' source, that of the stars, the choices within the tolerance, and
     bodies that are discs then.
     """
-    from hilstar.optics.layers.diffuse import DiffuseLayer
+    from hilstar.optics.layers.diffuse_layer import DiffuseLayer
     from hilstar.server.bench.effort_report import effort_lines
-    from hilstar.server.bench.moving import observer_lines, satellite_lines, wide_bodies
+    from hilstar.server.bench.moving_sky import observer_lines, satellite_lines, wide_bodies
 
     moving = bench.moving
     for line in [

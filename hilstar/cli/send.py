@@ -16,8 +16,10 @@ from hilstar.basics.process.interrupts import is_command, stop_on_signal
 from hilstar.basics.process.scheduling import PromptWhileLight
 from hilstar.basics.units import NS_PER_S
 from hilstar.cli import options
+from hilstar.cli.pointing import RadecText, StarText, place_of
 from hilstar.server.console.terminal import print_json, progress, say
 
+ORION_DEG = (84.057, -1.2, 0.0)  # RA, Dec and roll where a spin begins
 LISTEN_SLICE_S = 0.1  # between checks for a signal
 Share = Annotated[
     str,
@@ -47,12 +49,17 @@ def send(
         bool,
         Option("--connect", help="Connect instead of binding, for a bench file with bind = true."),
     ] = False,
-    radec: options.RadecText = None,
-    count: Annotated[int | None, Option(help="Stop after this many packets.", min=1)] = None,
-    duration: Annotated[
-        float | None, Option(metavar="S", help="Stop after this many seconds.", min=0)
+    radec: RadecText = None,
+    star: StarText = None,
+    count: Annotated[
+        int | None, Option(metavar="N", help="Stop after this many packets.", min=1)
     ] = None,
-    wait: Annotated[float, Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
+    duration: Annotated[
+        float | None, Option(metavar="SECONDS", help="Stop after this many seconds.", min=0)
+    ] = None,
+    wait: Annotated[
+        float, Option(metavar="SECONDS", help="Seconds to wait for a listener.", min=0, max=1e6)
+    ] = 30.0,
     sender: Annotated[
         int,
         Option(
@@ -71,7 +78,7 @@ def send(
             metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6
         ),
     ] = 0.0,
-    seed: Annotated[int, Option(help="Seed of the faults.", min=0, max=options.MAX_SEED)] = 0,
+    seed: Annotated[int, options.seed_option("Seed of the faults.")] = 0,
     secret_key: KeyFile = None,
     server_key: KeyFile = None,
     allowed_clients: Annotated[
@@ -97,7 +104,7 @@ def send(
             "send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller"
             " fractions"
         )
-    samples, total = wanted_samples(log, spin, rate, radec, statements)
+    samples, total = wanted_samples(log, spin, rate, place_of("send", radec, star), statements)
     if duration is not None:
         samples = takewhile(lambda sample: sample.t_ns < duration * NS_PER_S, samples)
     stop = threading.Event()
@@ -107,7 +114,9 @@ def send(
             Faults(lost, corrupted, reordered, jitter / 1000), np.random.default_rng(seed), link.put
         )
         say(f"waiting for a listener on {link.endpoint}")
-        if not heard(link, wait, stop):
+        with progress("waiting", wait) as waited:
+            is_heard = heard(link, wait, stop, waited)
+        if not is_heard:
             say("no listener yet; sending anyway")
         with progress("sending", min(total, count or math.inf)) as advance:
             send_samples(cable, islice(samples, count), stop, in_time(advance), sender)
@@ -133,7 +142,7 @@ def wanted_samples(
     log: Path | None,
     spin: str | None,
     rate: float | None,
-    radec: str | None,
+    place: tuple[float, float, float] | None,
     statements: options.LogStatements,
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
@@ -150,7 +159,7 @@ def wanted_samples(
             spin_samples(
                 options.parse_spin(spin),
                 rate or 100.0,
-                options.parse_radec(radec or "84.057,-1.2,0"),
+                place or ORION_DEG,
             ),
             math.inf,
         )
@@ -184,10 +193,12 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
         say(f"{fields['statuses']} statuses heard, {fields['requests']} time requests answered")
 
 
-def heard(sender: Any, wait_s: float, stop: threading.Event) -> bool:
+def heard(sender: Any, wait_s: float, stop: threading.Event, waited: Callable[[int], None]) -> bool:
     """True once a receiver listens, and when stopped, which then ends the sending at once."""
-    deadline_s = time.monotonic() + wait_s
+    started_s = time.monotonic()
+    deadline_s = started_s + wait_s
     while not stop.is_set():
+        waited(round(time.monotonic() - started_s))
         if sender.wait_for_listener(min(LISTEN_SLICE_S, max(0.0, deadline_s - time.monotonic()))):
             return True
         if time.monotonic() >= deadline_s:

@@ -7,7 +7,7 @@ from typer import Argument, Option
 
 from hilstar.basics.files import TOML, check_ending, refuse_stdout
 from hilstar.cli.options import Json, check_files
-from hilstar.server.console.terminal import print_found
+from hilstar.server.console.terminal import busy, print_found
 
 if TYPE_CHECKING:
     from hilstar.instruments.calibrate.sensor import SensorFile
@@ -57,12 +57,9 @@ def measure(
 
     _check(output)
     check_files([*flats, *darks], [output])
-    _tell(
-        output,
-        measure_sensor(flats, darks),
-        "By hilstar sensor measure; errors are one sigma",
-        as_json,
-    )
+    with busy("measuring"):
+        measured = measure_sensor(flats, darks)
+    _tell(output, measured, "By hilstar sensor measure; errors are one sigma", as_json)
 
 
 def _check(output: Path) -> None:

@@ -26,7 +26,6 @@ from hilstar.cli.options import (
     Overwrite,
     ScenarioFile,
     check_files,
-    frames_of,
     parse_split,
 )
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
@@ -148,12 +147,13 @@ def serve(
     bench_file: BenchFile,
     headless: Headless = False,
     duration: Annotated[
-        float | None, Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)
+        float | None,
+        Option(metavar="SECONDS", help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8),
     ] = None,
     frames: Annotated[
-        list[str] | None,
-        Option(metavar="N|ENDPOINT", help=f"Number of frames to draw. {running.FRAMES_HELP}."),
+        int | None, Option(metavar="N", help="Number of frames to draw.", min=1)
     ] = None,
+    feed: running.Feed = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
     scenario: ScenarioFile = None,
@@ -177,16 +177,20 @@ def serve(
     from hilstar.server.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
 
     file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
-    count, watch = frames_of(frames, heads=isinstance(file, HeadsFile))
     if isinstance(file, HeadsFile):
         from hilstar.server.heads import HeadsRun
 
+        if feed is not None:
+            raise InputError(
+                f"--feed {feed}: one endpoint for several heads; serve one head's file, or leave it"
+                " out"
+            )
         if scpi is not None:
             raise InputError(
                 f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench"
                 " file of a head"
             )
-        valued = {"--frames": count, "--ledger-split": ledger_split, "--scenario": scenario}
+        valued = {"--frames": frames, "--ledger-split": ledger_split, "--scenario": scenario}
         switches = {
             "--headless": headless,
             "--windowed": windowed,
@@ -230,7 +234,7 @@ def serve(
         running.optional_ledger(ledger, bench, notices, overwrite, split) as run_ledger,
         running.run_with_faults(bench, faults, notices, run_ledger) as wrong,
         running.optional_answers(bench, notices, run_ledger, screen) as answers,
-        running.optional_frames(watch, bench, screen) as watched,
+        running.optional_frames(feed, bench, screen) as watched,
     ):
         if explain:
             running.explain_bench(
@@ -239,7 +243,7 @@ def serve(
         refresh_hz = bench.config.monitor.refresh_hz
         limit = Limit(
             math.inf if duration is None else round(duration * refresh_hz),
-            math.inf if count is None else count,
+            math.inf if frames is None else frames,
         )
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")

@@ -15,10 +15,11 @@ from typer import Argument, Option
 
 from hilstar.basics.errors import InputError, cannot_write, shortened
 from hilstar.basics.files import refuse_existing, write_whole
-from hilstar.cli.options import BenchFile, Overwrite, with_values
+from hilstar.cli.old_names import with_present_names
+from hilstar.cli.options import BenchFile, Json, Overwrite, with_values
 from hilstar.cli.running import UTC_MARK
 from hilstar.cli.serve import serve
-from hilstar.server.console.terminal import say
+from hilstar.server.console.terminal import print_found, print_json, say
 
 if TYPE_CHECKING:
     from hilstar.server.console.listener import ListenAddress
@@ -95,6 +96,7 @@ def install(
         bool, Option("--print", help="Print the unit, and write nothing.")
     ] = False,
     overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds
     whenever it ends.
@@ -112,15 +114,23 @@ def install(
             "this system gives users no namespace of their own: the unit keeps the capabilities"
             " that systemd gives it"
         )
+    fields = {"service": service, "unit": str(path), "confined": confined, "text": text}
     if to_stdout:
-        typer.echo(text, nl=False)
+        if as_json:
+            print_json(fields | {"token_file": None, "written": []})
+        else:
+            typer.echo(text, nl=False)
         return
     refuse_existing(path, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)
         tokens = path.with_suffix(".env")
-        if console is not None and not console.is_loopback and not tokens.exists():
+        if console is None or console.is_loopback:
+            token_file = None
+        else:
+            token_file = str(tokens)
+        if token_file is not None and not tokens.exists():
             import secrets  # hashes and random numbers, which no other command needs
 
             with os.fdopen(
@@ -130,7 +140,7 @@ def install(
             say(f"the token of the operator's page is in {tokens}")
     except OSError as error:
         raise cannot_write(path, error) from error
-    typer.echo(str(path))
+    print_found(as_json, fields | {"token_file": token_file, "written": [str(path)]}, [str(path)])
     say(
         "start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user"
         f" enable --now {service}"
@@ -150,6 +160,7 @@ def uninstall(
             help="The service's name, as install printed it; by default the bench file's.",
         ),
     ],
+    as_json: Json = False,
 ) -> None:
     """Stop a service, and delete its unit and its token."""
     bare = name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
@@ -171,7 +182,7 @@ def uninstall(
     except OSError as error:
         raise cannot_write(path, error) from error
     _systemctl("daemon-reload")
-    typer.echo(str(path))
+    print_found(as_json, {"unit": str(path), "stopped": stopped}, [str(path)])
     if not stopped:
         say(
             "no systemd of this user was reached: if it still runs, systemctl --user stop"
@@ -192,7 +203,7 @@ def _systemctl(*words: str) -> bool:
 def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
     from hilstar.server.console.listener import parse_address
 
-    option_words = with_values(options)
+    option_words = with_values(with_present_names(["serve", *options])[1:])
     alone = typer.Typer()
     alone.command()(serve)
     try:

@@ -10,8 +10,9 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.cli import options
+from hilstar.cli.pointing import QuaternionText, RadecText, StarText, attitude_of
 from hilstar.cli.running import optional_scenario, say_units_of
-from hilstar.server.console.terminal import print_found, progress, say
+from hilstar.server.console.terminal import busy, print_found, progress, say
 
 if TYPE_CHECKING:
     from hilstar.instruments.simulate.simulator import FrameNoise
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
 @options.log_statements
 def simulate(
     bench_file: options.BenchFile,
-    radec: options.RadecText = None,
-    quaternion: options.QuaternionText = None,
-    rate: Annotated[
+    radec: RadecText = None,
+    star: StarText = None,
+    quaternion: QuaternionText = None,
+    slew: Annotated[
         str | None,
         Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s."),
     ] = None,
@@ -34,12 +36,14 @@ def simulate(
     ] = None,
     frames: Annotated[
         int | None,
-        Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1),
+        Option(
+            metavar="N",
+            help="With --log: this many, evenly spaced; by default one for each sample.",
+            min=1,
+        ),
     ] = None,
     statements: options.LogStatements = options.NOTHING_STATED,
-    seed: Annotated[
-        int, Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)
-    ] = 0,
+    seed: Annotated[int, options.seed_option("Seed of the frame's noise.")] = 0,
     noise: Annotated[
         Literal["full", "none"], Option(help="The detector's full noise, or none.")
     ] = "full",
@@ -64,10 +68,10 @@ def simulate(
     from hilstar.server.bench.bench_file import at_moment, read_bench_file
 
     if log is not None:
-        if output is None or radec or quaternion or rate or png or dn_png or at is not None:
+        if output is None or radec or star or quaternion or slew or png or dn_png or at is not None:
             raise InputError(
-                "simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png"
-                " or --dn-png"
+                "simulate --log LOG: give -o DIR, and no --radec, --star, --quaternion, --slew,"
+                " --at, --png or --dn-png"
             )
         check_directory("-o", output)
         simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario, statements)
@@ -84,14 +88,14 @@ def simulate(
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
     wrong = optional_scenario(scenario)
     options.check_files([scenario], targets, file)
-    q = options.parse_attitude("simulate", radec, quaternion)
+    q = attitude_of("simulate", radec, star, quaternion, file.config.sky.epoch_jyear)
     t_ns = options.parse_at("simulate", at, file.config, wrong is not None)
     file = at_moment(file, t_ns)
-    if rate:
-        rate_rad_s = np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s"))
+    if slew:
+        rate_rad_s = np.radians(options.parse_numbers(slew, 3, "--slew", "X,Y,Z in deg/s"))
     else:
         rate_rad_s = np.zeros(3)
-    with Simulator(file) as simulator:
+    with busy("exposing"), Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         view = simulator.view(q, rate_rad_s, t_ns)
         if wrong is None:

@@ -10,7 +10,8 @@ from typer import Argument, Option
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.options import Json, check_files, parse_radec
+from hilstar.cli.options import Json, check_files
+from hilstar.cli.pointing import StarText, place_of
 from hilstar.server.console.terminal import print_found, progress
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ Study = Literal[
     "colour",
     "confront",
     "limits",
+    "rigs",
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file
@@ -71,6 +73,7 @@ def study(
             help="Of `models` and `outputs` of a bench: a field of one's own, beside the three.",
         ),
     ] = None,
+    star: StarText = None,
     quick: Annotated[
         bool, Option("--quick", help="Fewer rounds, where a full study takes minutes.")
     ] = False,
@@ -87,8 +90,8 @@ def study(
     methods fail.
     """
     check_directory("-o", output)
-    refuse_unused(what, bench, radec, images)
-    place = None if radec is None else parse_radec(radec)
+    refuse_unused(what, bench, radec, star, images)
+    place = place_of("study", radec, star)
     answers: list[str] = []
     steps = CHAIN_SCENES if what == "chain" else math.inf
     with progress(f"study {what}", steps) as advance:
@@ -118,17 +121,22 @@ def study(
     print_found(as_json, fields, [*lines, f"figures and tables in {output}", *answers])
 
 
-def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path | None) -> None:
+def refuse_unused(
+    what: str, bench: Path | None, radec: str | None, star: str | None, images: Path | None
+) -> None:
     """Refuse (InputError) what a study does not use, and what it lacks."""
     if what == "chain" and bench is None:
         raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
     if bench is not None and what not in OF_A_BENCH:
         raise InputError(f"study {what}: has benches of its own; leave out {bench}")
-    if radec is not None and what not in OF_A_FIELD:
-        raise InputError(f"study {what}: has fields of its own; leave out --radec")
-    if radec is not None and bench is None:
-        example = f"hilstar study {what} BENCH.toml --radec {radec}"
-        raise InputError(f"study {what} --radec: a field is seen by a bench; write {example}")
+    for option, given in (("--radec", radec), ("--star", star)):
+        if given is None:
+            continue
+        if what not in OF_A_FIELD:
+            raise InputError(f"study {what}: has fields of its own; leave out {option}")
+        if bench is None:
+            example = f"hilstar study {what} BENCH.toml {option} {given}"
+            raise InputError(f"study {what} {option}: a field is seen by a bench; write {example}")
     if what == "confront" and images is None:
         raise InputError("study confront: is of photographs; add --images DIR")
     if what != "confront" and images is not None:

@@ -16,6 +16,7 @@ from typer import Option
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import is_command, stop_on_signal
 from hilstar.cli import options
+from hilstar.cli.completion import offered
 from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def tracker(
     bench_file: options.BenchFile,
     watch: Annotated[
         str,
-        Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from."),
+        Option(metavar="ENDPOINT", help="Where serve or replay --feed sends its frames from."),
     ],
     answer: Annotated[
         str | None,
@@ -80,6 +81,7 @@ def tracker(
         str | None,
         Option(
             metavar="truth|tetra3|CMD",
+            autocompletion=offered(("truth", "tetra3")),
             help=(
                 "Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve],"
                 " the default where it is"
@@ -89,7 +91,13 @@ def tracker(
         ),
     ] = None,
     form: Annotated[
-        str, Option("--format", metavar="packet|json", help="The format of the answers.")
+        str,
+        Option(
+            "--format",
+            metavar="packet|json",
+            help="The format of the answers.",
+            autocompletion=offered(("packet", "json")),
+        ),
     ] = "packet",
     connect: Annotated[
         bool,
@@ -124,19 +132,21 @@ def tracker(
     babble: Annotated[bool, planted("--babble", help="Send garbage between answers.")] = False,
     latency: Annotated[
         float,
-        planted(metavar="S", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S),
+        planted(
+            metavar="SECONDS", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S
+        ),
     ] = 0.0,
     clock_drift: Annotated[
         float, planted(metavar="PPM", help="Of its own clock.", min=-MAX_PPM, max=MAX_PPM)
     ] = 0.0,
     clock_offset: Annotated[
-        float, planted(metavar="S", help="Of its own clock.", min=-MAX_S, max=MAX_S)
+        float, planted(metavar="SECONDS", help="Of its own clock.", min=-MAX_S, max=MAX_S)
     ] = 0.0,
-    seed: Annotated[int, Option(help="Seed of noise and errors.", min=0, max=options.MAX_SEED)] = 0,
+    seed: Annotated[int, options.seed_option("Seed of noise and errors.")] = 0,
     duration: Annotated[
         float | None,
         Option(
-            metavar="S",
+            metavar="SECONDS",
             help="Seconds from the first frame; by default until Ctrl-C.",
             min=0,
             max=1e8,

@@ -8,7 +8,7 @@ from typer import Option
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
+from hilstar.cli.options import BenchFile, Json, ScenarioFile, seed_option
 from hilstar.cli.running import optional_scenario, say_units_of
 from hilstar.server.console.terminal import print_found, print_json, progress
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 def verify(
     bench_file: BenchFile,
-    fields: Annotated[int, Option(help="Number of random attitudes.", min=1, max=100_000)] = 10,
-    seed: Annotated[
-        int, Option(help="Seed of the attitudes and the noise.", min=0, max=MAX_SEED)
-    ] = 0,
+    fields: Annotated[
+        int, Option(metavar="N", help="Number of random attitudes.", min=1, max=100_000)
+    ] = 10,
+    seed: Annotated[int, seed_option("Seed of the attitudes and the noise.")] = 0,
     output: Annotated[
         Path | None,
         Option("-o", "--output", metavar="DIR", help="Directory for charts and a table."),

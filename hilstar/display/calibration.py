@@ -305,10 +305,15 @@ def _response(
     }
     if weights is None or ("w" in tables and not bit_stealing):
         return responses.table_response(bits, tables["w"].light, black), weights
-    r, g, b = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
-    return (responses.bit_stealing_response if bit_stealing else responses.mixed_response)(
-        (r, g, b), weights, black
-    ), weights
+    if "w" in tables:
+        by_primary = tables["w"], tables["w"], tables["w"]
+    else:
+        by_primary = tables["r"], tables["g"], tables["b"]
+    if bit_stealing:
+        response = responses.bit_stealing_response(by_primary, weights, black)
+    else:
+        response = responses.mixed_response(by_primary, weights, black)
+    return response, weights
 
 
 class CalibrationHead(Table, frozen=True):
@@ -387,7 +392,9 @@ KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
 
 
 def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYTES) -> str:
-    """The text of a file, whose bytes are added to those that were `read`."""
+    """The text of a file. Its bytes are appended to `read`, from which the calibration's hash is
+    made.
+    """
     raw = read_bytes(path, ADVICE, limit_bytes)
     if read is not None:
         read.append(raw)
@@ -554,12 +561,11 @@ def write_calibration(
     where they cannot be written.
     """
     table = path.parent / head.response
-    codes = np.arange(len(next(iter(columns.values()))))
-    rows = "".join(
-        ",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n"
-        for code in codes
-    )
-    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n"
+    lines = [",".join(["code", *columns])]
+    for code, lights in enumerate(zip(*columns.values(), strict=True)):
+        lines.append(",".join([str(code), *(repr(float(light)) for light in lights)]))
+    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included"
+    lines.insert(0, comment.encode("ascii", "replace").decode())
     tables: dict[str, Any] = {
         "calibration": head,
         "weights": weights,
@@ -570,10 +576,7 @@ def write_calibration(
         "errors": errors,
         TABLE: None if identity is None else identity.known(),
     }
-    write_whole(
-        table,
-        comment.encode("ascii", "replace").decode() + ",".join(["code", *columns]) + "\n" + rows,
-    )
+    write_whole(table, "\n".join(lines) + "\n")
     write_whole(path, toml_text(msgspec.to_builtins(tables)))
     return table
 
@@ -585,9 +588,8 @@ def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) 
     `relative` is the standard error of a field. Raises InputError where it cannot be written.
     """
     table = path.with_name(f"{path.stem}-uniformity.csv")
-    write_whole(
-        table, "".join(",".join(f"{value!r}" for value in row) + "\n" for row in grid.tolist())
-    )
+    rows = [",".join(map(repr, row)) for row in grid.tolist()]
+    write_whole(table, "".join(f"{row}\n" for row in rows))
     text = read_text(path, ADVICE, MAX_TOML_BYTES)
     if relative is None:
         known = ""

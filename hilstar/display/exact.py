@@ -46,10 +46,11 @@ EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """The errors of the sums (SUMS, n) that n sprites have to make up for, in steps from black.
+    """The errors (SUMS, n) that earlier sprites or frames left and n sprites have to make up for,
+    in steps from black.
 
-    Those of light and moments are plain, the others weighed. Where all steps of a star are equal,
-    `phase` (n,) is the part of one that its light has in hand.
+    Errors of light and first moments are as they are, all others times their weights. Where all
+    steps are equal, `phase` (n,), 0 to 1, is the part of a step that the star's light is ahead.
     """
 
     error: Float32Array
@@ -67,8 +68,8 @@ def nothing_carried(count: int) -> Carried:
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """The errors (SUMS, n) that the stars of a frame leave to the next one, and their numbers
-    (n,) as in `FrameLight.star`.
+    """The errors (SUMS, n) that the stars of a frame leave to the next frame; `star` (n,) are their
+    numbers, as in `FrameLight.star`.
     """
 
     star: IntArray
@@ -84,13 +85,14 @@ def _fits(psf: Psf) -> bool:
 
 
 class ExactQuantiser(quantise.Quantiser):
-    """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the
-    nearest ones.
+    """Chooses the levels of all pixels of a star together, so that the star's light and centroid
+    are right.
 
-    An instance chooses those of sprites of `psf` on a panel, image after image, for a tracker that
-    sees it as `seen`. `weights` are those of its sums. One that `remembers` begins each star with
-    what the last frame left, in `left`: None where each frame stands by itself, and at the
-    beginning of a sequence.
+    `shader` is the compute shader that does so, starting from the nearest levels. An instance does
+    it for sprites of `psf` on a panel, image after image, for a tracker that sees the panel as
+    `seen`. `weights` are those of the sums of errors that it keeps small (see `balance`). A
+    quantiser that `remembers` starts each star with the errors that the last frame left, `left`;
+    None at the beginning of a sequence, and where each frame stands by itself.
     """
 
     words = (
@@ -147,24 +149,22 @@ class ExactQuantiser(quantise.Quantiser):
 
     @classmethod
     def takes(cls, psf: Psf, gl_version: int) -> bool:
-        """Whether the shader runs on this OpenGL, and takes such sprites."""
+        """Whether the shader runs on this version of OpenGL, and draws sprites of this PSF."""
         return gl_version >= COMPUTE_VERSION and _fits(psf)
 
     @classmethod
     def cost(cls, psf: Psf, gl_version: int) -> quantise.LevelCost:
         """The cost of the shader, or of NumPy where the shader cannot draw."""
-        has_compute = gl_version >= COMPUTE_VERSION
-        if _fits(psf):
-            by_numpy_ms = NUMPY_EXACT_MS_A_STAR
-        else:
-            by_numpy_ms = WIDE_EXACT_MS_A_STAR
-        if has_compute:
-            why = ""
-        else:
+        why = ""
+        if gl_version < COMPUTE_VERSION:
             why = "in NumPy: its compute shaders need OpenGL 4.3"
-        return quantise.LevelCost(
-            EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why
-        )
+        if cls.takes(psf, gl_version):
+            ms_a_star = EXACT_MS_A_STAR
+        elif _fits(psf):
+            ms_a_star = NUMPY_EXACT_MS_A_STAR
+        else:
+            ms_a_star = WIDE_EXACT_MS_A_STAR
+        return quantise.LevelCost(ms_a_star, why)
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:
@@ -356,8 +356,10 @@ def _sprites_in_path(sprites: FrameLight) -> IntArray:
 def _hand_on(
     carried: Float32Array, left: Float32Array, some: IntArray, sprites: FrameLight
 ) -> None:
-    """Give the errors `left` (SUMS, n) of sprites `some` to those that follow them in their
-    paths, about their centres.
+    """Pass the errors `left` (SUMS, n) of sprites `some` to the sprites that follow them on their
+    paths.
+
+    Moments are about a sprite's centre: they are moved to the centre of the one that follows.
     """
     if sprites.per_star == 1:
         return
@@ -423,10 +425,10 @@ def _turn_one_more(
     error: Float32Array,
     grid: Float32Array,
 ) -> None:
-    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other
-    sums the least harm.
+    """Change one more pixel of each star whose light is a step off though all steps are equal
+    (`grid` > 0): the one that adds least to the errors of the other sums.
 
-    `step` and `arm` as in `_decide`, whose results are changed.
+    `step` and `arm` are as in `_decide`, whose results are changed.
     """
     stars = np.flatnonzero(np.abs(error[0]) > OFF * arm[0, 0] * np.where(grid > 0, grid, np.inf))
     if not len(stars):
@@ -443,8 +445,10 @@ def _turn_one_more(
 
 
 class Turn(NamedTuple):
-    """One of a target's panels: for how much of what stars left in each, in its steps, they make
-    up here; choices kept.
+    """The turn of one panel of a target, whose panels are quantised one after the other.
+
+    Stars make up in it for the share `makes_up` [panel] of the errors that they left in each panel
+    before, in steps of both. `kept` is how many of the choices tried are kept.
     """
 
     plane: int

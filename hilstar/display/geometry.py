@@ -21,8 +21,8 @@ from hilstar.display.identity import TABLE, MonitorIdentity
 from hilstar.optics.camera import Camera, Lens, ResidualField
 
 MAX_FILE_BYTES = 1_000_000
-MAX_TERMS = 21
-NORM_TOLERANCE = 1e-3
+MAX_TERMS = 21  # along each axis of [field]
+NORM_TOLERANCE = 1e-3  # of q_cam_to_mon as it is written, which is then normalised
 ADVICE = "give a file that `hilstar calibrate geometric` or `alignment` wrote"
 Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
@@ -162,14 +162,15 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
             )
         residual = ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
     a, b = geometry.tilt_deg
+    max_tangent = math.inf
+    if geometry.max_field_deg is not None:
+        max_tangent = math.tan(math.radians(geometry.max_field_deg))
     lens = Lens(
-        (geometry.k1, geometry.k2, geometry.k3),
-        (geometry.p1, geometry.p2),
-        (float(np.radians(a)), float(np.radians(b))),
-        residual,
-        math.inf
-        if geometry.max_field_deg is None
-        else math.tan(math.radians(geometry.max_field_deg)),
+        radial=(geometry.k1, geometry.k2, geometry.k3),
+        tangential=(geometry.p1, geometry.p2),
+        tilt_rad=(float(np.radians(a)), float(np.radians(b))),
+        field=residual,
+        max_tangent=max_tangent,
     )
     return Camera(
         resolution_px,
@@ -227,6 +228,9 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     coefficients: dict[str, Any] = dict(
         zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True)
     )
+    max_field_deg = None
+    if math.isfinite(lens.max_tangent):
+        max_field_deg = math.degrees(math.atan(lens.max_tangent))
     geometry = GeometryFile(
         kind=KIND,
         resolution_px=camera.resolution_px,
@@ -235,9 +239,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         q_cam_to_mon=(w, x, y, z),
         tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
         **coefficients,
-        max_field_deg=(
-            math.degrees(math.atan(lens.max_tangent)) if math.isfinite(lens.max_tangent) else None
-        ),
+        max_field_deg=max_field_deg,
         field=field,
         sigma=notes.sigma,
         error=notes.error,

@@ -59,8 +59,9 @@ class ChannelMatrix:
     """`e_per_s` (channels, 3): electrons per second in each of `channels` by each primary of a
     pixel at full light.
 
-    By `condition` times as much as the channels' light can the primaries' be wrong, both relative;
-    None where two channels, or two primaries, have the same colour.
+    `condition` is the matrix's condition number: a relative error of the channels' light may be so
+    many times as large in the primaries' light. None where two channels, or two primaries, have the
+    same colour.
     """
 
     channels: tuple[str, ...]
@@ -140,9 +141,8 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
             f" mixtures (the nearest leave {100 * worst:.0f} % of one): a white subpixel, or"
             f" samples of several displays; {CCSS_ADVICE}"
         )
-    _, _, three = min(
-        (one for one in fits if one[0] <= worst + MIXED_WITHIN**2), key=lambda one: one[1]
-    )
+    near_best = [fit for fit in fits if fit[0] <= worst + MIXED_WITHIN**2]
+    _, _, three = min(near_best, key=lambda fit: fit[1])
     size = np.linalg.norm(samples[lit], axis=1)
     drive = (
         nearest_mixtures(together[np.ix_(three, three)], together[:, three])
@@ -166,11 +166,11 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
     try:
         head, _, rest = text.partition("BEGIN_DATA_FORMAT")
         names, _, rest = rest.partition("END_DATA_FORMAT")
-        keys = dict(
-            words
-            for line in head.splitlines()
-            if len(words := shlex.split(line, comments=True)) == 2
-        )
+        keys: dict[str, str] = {}
+        for line in head.splitlines():
+            words = shlex.split(line, comments=True)
+            if len(words) == 2:
+                keys[words[0]] = words[1]
         first = float(keys["SPECTRAL_START_NM"])
         last = float(keys["SPECTRAL_END_NM"])
         nm = np.linspace(first, last, int(keys["SPECTRAL_BANDS"]))
@@ -198,7 +198,7 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
 
     Raises InputError where none is near.
     """
-    matching = np.array([sum(t * _lobe(m, a, b) for t, m, a, b in lobes) for lobes in MATCHING])
+    matching = np.array([_matching_function(lobes) for lobes in MATCHING])
     middles = np.arange(XY_NM[0], XY_NM[-1], 0.25)
     spectra = np.exp(-((XY_NM - middles[:, None]) ** 2) / 2 * (FWHM_SIGMAS / fwhm_nm) ** 2)
     tristimulus = spectra @ matching.T
@@ -226,6 +226,16 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
     return _curves(XY_NM, spectra[chosen] * amounts[:, None])
 
 
+def _matching_function(lobes: Sequence[tuple[float, float, float, float]]) -> FloatArray:
+    """A colour matching function at XY_NM, of lobes (weight, middle, and the inverse of its
+    sigmas below and above).
+    """
+    values = np.zeros(len(XY_NM))
+    for weight, middle_nm, below, above in lobes:
+        values += weight * _lobe(middle_nm, below, above)
+    return values
+
+
 def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
     away = XY_NM - middle_nm
     return np.asarray(np.exp(-((away * np.where(away < 0, below, above)) ** 2) / 2))
@@ -249,9 +259,9 @@ def channel_matrix(
     wavelength: photons are counted. Raises InputError where the tracker detects no light of the
     primaries.
     """
-    matrix = np.array(
-        [[_electrons(primary, optics) for primary in primaries] for optics in channels.values()]
-    )
+    matrix = np.empty((len(channels), len(primaries)))
+    for row, optics in enumerate(channels.values()):
+        matrix[row] = [_electrons(primary, optics) for primary in primaries]
     if not matrix.any():
         raise InputError(
             "[monitor.primaries] file: the tracker detects none of this light; check that both are"

@@ -341,9 +341,9 @@ def lit_light(levels: Levels, panel: Panel) -> LitLight:
     """
     place = np.flatnonzero(levels)
     light = panel.response.light[levels.ravel()[place]] * panel.flux_at_white_e_per_s
-    return LitLight(
-        place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
-    )
+    if panel.uniformity is not None:
+        light = light * panel.uniformity.ravel()[place]
+    return LitLight(place, light)
 
 
 def primary_levels(levels: Levels, panel: Panel) -> list[tuple[Levels, Panel]]:

@@ -66,6 +66,7 @@ class TemporalQuantiser(ExactQuantiser):
 
     def levels(self, sprites: FrameLight | None, floor: Levels | None = None) -> Levels:
         """The levels of the next frame, as `exact`'s."""
+        # a frame without stars ends the sequence: nothing makes up for the errors before it
         if sprites is None or not len(sprites):
             self.left = None
         return super().levels(sprites, floor)

@@ -525,8 +525,10 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
 
 
 def _wide(tangents: FloatArray) -> tuple[float, float]:
-    """The smallest and the largest, and a little more: a side may bow between two of its places;
-    all, where one is unknown.
+    """The range of tangents along the image's border, widened by BOW of itself, as a side may bow
+    between two of its places.
+
+    ANY_TANGENT where the tangent of a place is not known (NaN).
     """
     low = float(tangents.min())
     high = float(tangents.max())

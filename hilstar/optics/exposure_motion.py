@@ -34,6 +34,7 @@ MIN_PATH_SIGMA = 0.005
 # A longer turn is cut into pieces of this angle, so that each is short compared with the field and
 # has enough nodes.
 MAX_PIECE_RAD = 0.05
+# the longest piece that MAX_NODES can draw
 MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
 # An exposure's work is bounded: more pieces are refused, and more sprites are thinned out by nodes
 # farther apart.
@@ -77,10 +78,11 @@ class Motion:
 def own_row_s(
     paths: Paths, star: IntArray | slice, seconds: FloatArray, scan: Scan
 ) -> tuple[FloatArray, FloatArray]:
-    """When stars (k,) of some paths are at `seconds` (k,) of their own rows' exposures, and dt /
-    ds: how much longer that is.
+    """Times (k,) at which stars are `seconds` (k,) from the middle of their own rows' exposures,
+    and the rate (k,) at which these times grow with `seconds`.
 
-    Seconds count from the middle of the middle row's exposure.
+    Times count from the middle of the middle row's exposure. A star that moves along the scan stays
+    in lit rows longer: its rate is above 1.
     """
     size_px = paths.camera.resolution_px
     row_s = seconds

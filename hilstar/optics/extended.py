@@ -181,17 +181,13 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
     if isinstance(light, LightMap):
         from scipy.ndimage import shift
 
-        image, cover = (
-            (
-                None
-                if one is None
-                else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
-            )
-            for one, most in ((light.image, np.inf), (light.cover, 1.0))
-        )
+        # Splines overshoot: no light is negative, and nothing hides more than all.
+        offset_px = (down_px, right_px)
+        image = shift(np.pad(light.image, 1), offset_px, output=np.float32).clip(0.0)
+        cover = light.cover
+        if cover is not None:
+            cover = shift(np.pad(cover, 1), offset_px, output=np.float32).clip(0.0, 1.0)
         corner = light.corner_px[0] - 1, light.corner_px[1] - 1
-        if image is None:
-            return light
         return replace(light, image=image, cover=cover, corner_px=corner)
     x_px, y_px = light.camera.principal_point_px
     return replace(
@@ -205,12 +201,8 @@ def clipped(
     """The pixels of an image within left, top, right and bottom (the last two excluded); None
     where there is none.
     """
-    (left, right), (top, bottom) = (
-        np.clip((np.floor(edges_px[k]), np.ceil(edges_px[k + 2])), 0, resolution_px[k])
-        .astype(int)
-        .tolist()
-        for k in (0, 1)
-    )
+    left, top = np.floor(edges_px[:2]).clip(0, resolution_px).astype(int).tolist()
+    right, bottom = np.ceil(edges_px[2:]).clip(0, resolution_px).astype(int).tolist()
     if right > left and bottom > top:
         return (left, top, right - left, bottom - top)
     return None

@@ -365,7 +365,9 @@ class LensTable:
 
 
 def _mapping(camera: Camera) -> tuple[tuple[int, int], float, tuple[float, float], Lens | None]:
-    """What places depend on: the same of many cameras, by which tables are kept."""
+    """The part of a camera by which directions become pixels: the key by which lens tables are
+    kept.
+    """
     return camera.resolution_px, camera.focal_length_px, camera.principal_point_px, camera.lens
 
 

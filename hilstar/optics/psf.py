@@ -30,7 +30,7 @@ from hilstar.basics.reading import read_bytes
 # cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a
 # tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
-MAX_GAUSSIAN_PX = 100_000
+MAX_GAUSSIAN_PX = 100_000  # the largest footprint that is tried
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
 SQRT2 = math.sqrt(2.0)
 # Error of the polynomial in a pixel along one axis, relative to a star's flux. The float32 erf is
@@ -38,7 +38,7 @@ SQRT2 = math.sqrt(2.0)
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
 FIT_PLACES, FIT_ROUNDS = 120, 15
-BOUND_PLACES = 200
+BOUND_PLACES = 200  # along an axis, at which an upper bound is taken
 # The rational approximation of erf in shaders/shares.glsl, above and below the line, the highest
 # power first.
 ERF_REACH = 4.0
@@ -228,7 +228,9 @@ class Psf(ABC):
         return self
 
     def simpler(self) -> Iterator[tuple[str, Callable[[], "Psf"]]]:
-        """What makes PSFs that take less to draw, by name, the least first."""
+        """PSFs that are cheaper to draw, the cheapest first: the name of each, and a function that
+        makes it. None by default.
+        """
         yield from ()
 
     @property

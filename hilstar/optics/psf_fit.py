@@ -24,6 +24,7 @@ MAX_CORRELATION = 0.95
 FIT_ROUNDS = 8
 MAX_STEP_PX, MAX_STEP_SHARE = 0.3, 0.6  # of a place, and of a variance, in one round
 RIDGE = 1e-9  # on unit columns: two that are alike share the light
+# residuals of more than so many medians count less, anew in each round
 FIELD_ROUNDS, OUTLIER_MEDIANS = 5, 2.0
 SMALLEST = 1e-300
 XX, YY, XY = 0, 1, 2
@@ -138,7 +139,7 @@ class PixelGaussians:
         return np.asarray(np.einsum("nrwk,nwk->nrw", self._light, weight))
 
     def _moment(self, over_x: FloatArray, power: int) -> FloatArray:
-        """The same times y to a power, mean over each pixel's height: (n, h, w)."""
+        """The mean of y^power times the Gaussian over each pixel's height: (n, h, w)."""
         count, height, width = self._size
         rows = over_x.reshape(count, height, self._nodes, width)
         weight = self._weight[:, None] * self._y**power

@@ -394,19 +394,14 @@ def extended_by_share(
     ]
     wide = shares_at(shares, stars, np.array(lights, dtype=np.intp))
     for place, (light, body) in enumerate(zip(sprites.extended, lights, strict=True)):
-        if (
-            by_bv is not None
-            and body < 0
-            and (bv_mag := getattr(light, "bv_mag", None)) is not None
-        ):
+        # light that is neither a star's nor a body's, as a fault's, has a colour of its own
+        bv_mag = getattr(light, "bv_mag", None)
+        if by_bv is not None and body < 0 and bv_mag is not None:
             wide[place] = shares_by_bv(by_bv, bv_mag)
-    return [
-        tuple(
-            times(light, float(part))
-            for light, part in zip(sprites.extended, channel_shares, strict=True)
-        )
-        for channel_shares in wide.T
-    ]
+    lights_by_column: list[tuple[ExtendedLight, ...]] = []
+    for column_shares in wide.T.tolist():
+        lights_by_column.append(tuple(map(times, sprites.extended, column_shares)))
+    return lights_by_column
 
 
 def clipped_sprites(

@@ -131,7 +131,7 @@ def _cameras() -> Check:
     if not has_aravis():
         return Check("cameras", ok=False, detail=f"not looked for: {INSTALL}", required=False)
     lines = [
-        f"{camera['vendor']}-{camera['model']}, serial {camera['serial']}, at {camera['address']}"
+        "{vendor}-{model}, serial {serial}, at {address} ({protocol})".format(**camera)
         for camera in list_cameras()
     ]
     return Check("cameras", bool(lines), "; ".join(lines) or "no camera", required=False)

@@ -1,4 +1,4 @@
-"""The frames of a run, handed to whoever watches (`--frames ENDPOINT`), off the frame loop's
+"""The frames of a run, handed to whoever watches (`--feed ENDPOINT`), off the frame loop's
 critical path.
 
 The loop copies a frame's levels into one of few buffers: 0.1 ms at 1080p, and nothing where nobody

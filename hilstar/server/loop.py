@@ -14,7 +14,7 @@ from typing import Any
 import scipy.special  # noqa: F401 - takes 0.1 s, which the first star that might clip is not to cost its frame
 from msgspec import UNSET, UnsetType
 
-import hilstar.display.render.extended  # noqa: F401 - takes 5 ms, which the first body is not to cost its frame
+import hilstar.display.render.extended_drawing  # noqa: F401 - takes 5 ms, which the first body is not to cost its frame
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.basics.errors import GpuError
 from hilstar.basics.notices import Notices

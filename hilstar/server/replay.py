@@ -45,7 +45,8 @@ from hilstar.server.record.ledger_records import (
     frame_records,
     read_head,
 )
-from hilstar.server.serve import Outlet, Running
+from hilstar.server.run_progress import Running
+from hilstar.server.serve import Outlet
 from hilstar.server.summary import RunSummary
 
 MAX_FRAMES = 100_000_000

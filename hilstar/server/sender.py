@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.links import Arrival, LinkCounts
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import (
     DELIMITER,
     AnswerPacket,
@@ -28,6 +28,7 @@ from hilstar.attitude.wire.packet import (
     framed,
 )
 from hilstar.attitude.wire.protocol import MAX_SENDER
+from hilstar.attitude.wire.roads import LinkCounts
 from hilstar.attitude.wire.serial_link import SerialLink, serial_target
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqSender

@@ -4,7 +4,7 @@ frame of each attitude.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -13,7 +13,6 @@ from msgspec.structs import replace as replaced
 
 from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck
-from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
 from hilstar.attitude.wire import protocol
@@ -42,27 +41,11 @@ from hilstar.server.operator import Aids, Operator, SwitchRequests
 from hilstar.server.pacer import FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.server.record.ledger import Ledger, LedgerSwitch
 from hilstar.server.record.ledger_records import below_step, frame_record
+from hilstar.server.run_progress import Follower, Running
 from hilstar.server.screen.screen import DisplayPacer, Screen
 from hilstar.server.summary import RunSummary, verdict_of
 
 POLL_MS = 50
-
-
-@dataclass(frozen=True, slots=True)
-class Running:
-    """Counters of a run in progress, readable from any thread; `clock` tells of the sender's clock,
-    None without a sender.
-
-    `answers` are the tracker's, None where the bench file names none.
-    """
-
-    loop: FrameLoop
-    packets: PacketCounts
-    clock: Callable[[], ClockSummary] | None = None
-    answers: LiveAnswers | None = None
-
-
-Follower = Callable[[Running], None]  # called once, when a run begins
 
 
 @dataclass(frozen=True, slots=True)

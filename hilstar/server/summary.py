@@ -74,6 +74,8 @@ def verdict_of(summary: "RunSummary") -> RunVerdict:
     good = not (stale or summary.missed_frames or wrong.seconds) and due > 0
     if good:
         head = f"the sky was right in all {due} frames"
+    elif due and not (stale or wrong.seconds):
+        head = "the sky was right, but late"
     else:
         head = "the sky was not right throughout"
     line = "; ".join([head, *reasons])

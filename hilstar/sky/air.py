@@ -61,7 +61,10 @@ def extinction_curve(name: str) -> Curve | None:
     header, *rows = [line.split(",") for line in EXTINCTION.read_text().splitlines()[1:]]
     if name not in header[1:]:
         return None
-    return Curve(*(np.array([float(row[k]) for row in rows]) for k in (0, header.index(name))))
+    column = header.index(name)
+    wavelength_nm = np.array([float(row[0]) for row in rows])
+    extinction_mag = np.array([float(row[column]) for row in rows])
+    return Curve(wavelength_nm, extinction_mag)
 
 
 def extinction_names() -> tuple[str, ...]:

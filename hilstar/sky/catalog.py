@@ -198,7 +198,8 @@ def plain_catalog(
         "epoch_jyear": np.full(n, HIPPARCOS_EPOCH_JYEAR),
         "identifier": np.arange(1, n + 1, dtype=np.int64),
     }
-    return Catalog(**(none | columns), designation=designation, rows_read=rows_read)  # type: ignore[arg-type]
+    columns = none | columns
+    return Catalog(**columns, designation=designation, rows_read=rows_read)  # type: ignore[arg-type]
 
 
 def load_catalog(source: str | Path = "hipparcos", faintest_v_mag: float = math.inf) -> Catalog:

@@ -69,15 +69,15 @@ class TangentImage:
         sigma = sigma_px * px_rad * whole.px_per_tangent
         if sigma < MIN_SIGMA:
             return whole
+        # The sky goes on beyond a face of a cube. Any other image ends in darkness, into which
+        # its light spreads.
         is_of_cube = math.isfinite(self.max_tangent)
         if is_of_cube:
-            padded = whole.image
+            image = gaussian_filter(whole.image, sigma, mode="nearest")
         else:
             padded = np.pad(whole.image, math.ceil(4 * sigma))
-        return replace(
-            whole,
-            image=gaussian_filter(padded, sigma, mode="nearest" if is_of_cube else "constant"),
-        )
+            image = gaussian_filter(padded, sigma, mode="constant")
+        return replace(whole, image=image)
 
     def _binned(self, count: int) -> "TangentImage":
         if count < 2:

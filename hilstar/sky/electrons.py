@@ -112,18 +112,22 @@ def all_channels(channels: Sequence[Optics]) -> Optics:
     """
     if len(channels) == 1:
         return channels[0]
-    curves = [channel.quantum_efficiency for channel in channels]
-    ranges = [channel.range_nm for channel in channels]
-    curves = [
-        curve if len(curve.wavelength_nm) else Curve(np.array(range_nm), np.full(2, curve.value[0]))
-        for curve, range_nm in zip(curves, ranges, strict=True)
-    ]
-    ends = [np.nextafter(curve.wavelength_nm[[0, -1]], [0.0, np.inf]) for curve in curves]
-    knots = np.unique(np.concatenate([*ends, *(curve.wavelength_nm for curve in curves)]))
-    return replace(
-        channels[0],
-        quantum_efficiency=Curve(knots, np.sum([curve(knots) for curve in curves], axis=0)),
-    )
+    curves = [_ranged_efficiency(channel) for channel in channels]
+    knots_nm = [curve.wavelength_nm for curve in curves]
+    beyond_nm = [np.nextafter(nm[[0, -1]], [0.0, np.inf]) for nm in knots_nm]
+    sum_nm = np.unique(np.concatenate([*beyond_nm, *knots_nm]))
+    efficiency = np.sum([curve(sum_nm) for curve in curves], axis=0)
+    return replace(channels[0], quantum_efficiency=Curve(sum_nm, efficiency))
+
+
+def _ranged_efficiency(channel: Optics) -> Curve:
+    """A channel's quantum efficiency as a curve that has knots: a number's are the ends of what
+    the channel detects.
+    """
+    curve = channel.quantum_efficiency
+    if len(curve.wavelength_nm):
+        return curve
+    return Curve(np.array(channel.range_nm), np.full(2, curve.value[0]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,16 +72,18 @@ def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
     place = np.minimum(np.searchsorted(facts["hip"], hip, sorter=order), len(order) - 1)
     row = order[place]
     has_row = facts["hip"][row] == hip
-    return {
-        name: np.where(has_row, values[row], np.nan if values.dtype.kind == "f" else b"")
-        for name, values in facts.items()
-        if name != "hip"
-    }
+    facts_by_name: dict[str, npt.NDArray[Any]] = {}
+    for name, values in facts.items():
+        if name == "hip":
+            continue
+        unknown = np.nan if values.dtype.kind == "f" else b""
+        facts_by_name[name] = np.where(has_row, values[row], unknown)
+    return facts_by_name
 
 
 def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
-    """Hipparcos' facts of a catalogue's stars (n,), but the errors of what is Hipparcos' own
-    alone, NaN for a table's stars.
+    """Hipparcos' facts of a catalogue's stars (n,). Their standard errors are those of Hipparcos'
+    own figures: NaN for the stars of a table, whose figures are not Hipparcos'.
     """
     facts = facts_of(catalog.hip)
     is_hipparcos = (catalog.identifier == catalog.hip) & (
@@ -129,7 +131,10 @@ def motion_at(
     jacobian = np.empty((len(catalog), 4, 4))
     for k in range(4):
         varied = start.astype(np.complex128)
-        varied[k] += 1j * STEP / (np.cos(start[1]) if k == 0 else 1.0)
+        if k == 0:
+            varied[k] += 1j * STEP / np.cos(start[1])  # RA: its error is given times cos Dec
+        else:
+            varied[k] += 1j * STEP
         du, d_ra, d_dec = (part.imag / STEP for part in _moved(varied, years))
         jacobian[:, 0, k] = (x * du[1] - y * du[0]) / flat
         jacobian[:, 1, k] = flat * du[2] - z * (x * du[0] + y * du[1]) / flat

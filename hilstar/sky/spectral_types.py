@@ -51,7 +51,7 @@ ANY_COLOUR = 0.3
 NOISE = 0.13
 LATE_SUBCLASS = (55.0, 65.0)
 LATE_EXTRA = 1.5
-TREND_DEGREE = 3
+TREND_DEGREE = 3  # of the polynomial in V-I that the rates' logarithms depart from
 BLOCK_STARS = 4000
 
 
@@ -59,8 +59,11 @@ def luminosity_class(spectral_type: npt.NDArray[np.bytes_]) -> npt.NDArray[np.st
     """The luminosity class in MK types (n,), such as "III" or "Ib": the first where two are
     given, "" where none is.
     """
-    matches = (CLASS.search(text.decode()) for text in spectral_type.tolist())
-    return np.array(["" if match is None else match[1] for match in matches], dtype=np.str_)
+    classes: list[str] = []
+    for text in spectral_type.tolist():
+        match = CLASS.search(text.decode())
+        classes.append("" if match is None else match[1])
+    return np.array(classes, dtype=np.str_)
 
 
 def read_types(spectral_type: npt.NDArray[np.bytes_]) -> FloatArray:
@@ -83,7 +86,8 @@ def _read(text: str) -> tuple[float, float]:
     if first and second:
         subclass.append(10.0 * LETTERS.index(other or letter) + float(second))
     classes = [CLASSES.get(name, 1.0) for name in CLASS.findall(text.partition("+")[0])]
-    return float(np.mean(subclass)), float(np.mean(classes)) if classes else np.nan
+    mean_class = float(np.mean(classes)) if classes else np.nan
+    return float(np.mean(subclass)), mean_class
 
 
 def star_types(catalog: Catalog) -> FloatArray:

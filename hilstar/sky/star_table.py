@@ -348,9 +348,8 @@ class _Columns:
         columns = self.table.columns
         if "gaia" in role:
             epoch = self.role("epoch_jyear", GAIA_DR3_JYEAR)
-            return "Gaia DR2" if (epoch == GAIA_DR2_JYEAR).all() else "Gaia DR3", np.asarray(
-                columns[role["gaia"]], dtype=np.int64
-            )
+            release = "Gaia DR2" if (epoch == GAIA_DR2_JYEAR).all() else "Gaia DR3"
+            return release, np.asarray(columns[role["gaia"]], dtype=np.int64)
         if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
             region, number, part = (
                 np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3")
@@ -734,11 +733,14 @@ def choose_catalog(choice: TableChoice) -> Catalog:
             )
         return load_catalog(choice.source, choice.faintest_v_mag)
     path = Path(choice.source)
+    hipparcos_sha256 = ""
+    if choice.with_hipparcos:
+        hipparcos_sha256 = hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest()
     made_of = (
         path.name,
         file_sha256(path, table_reader.FILE_WANTED),
         repr(choice.epoch_jyear),
-        hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest() if choice.with_hipparcos else "",
+        hipparcos_sha256,
     )
     place = store_path(made_of)
     made = kept(place) if place is not None else None
@@ -755,7 +757,9 @@ def _made(path: Path, choice: TableChoice) -> Kept:
     assembled = assemble(
         path, table_reader.read_table(path), choice.epoch_jyear, choice.with_hipparcos
     )
-    doubts = [*assembled.doubts, *([assembled.line] if assembled.dropped else [])]
+    doubts = list(assembled.doubts)
+    if assembled.dropped:
+        doubts.append(assembled.line)
     if not choice.with_hipparcos:
         return Kept(_by_cell(assembled.catalog, assembled.line), tuple(doubts))
     joined = join(load_catalog(), assembled.catalog)

@@ -211,12 +211,11 @@ class Stars:
         """The names of bodies and of stars without a HIP number among stars (n,), empty text for
         the others.
         """
-        first = len(self) - len(self.bodies)
-        named = (self.hip[which] == 0).tolist()
-        return [
-            self._name(i, first) if has_name else ""
-            for i, has_name in zip(which.tolist(), named, strict=True)
-        ]
+        first_body = len(self) - len(self.bodies)
+        names = [""] * len(which)
+        for place in np.flatnonzero(self.hip[which] == 0).tolist():
+            names[place] = self._name(int(which[place]), first_body)
+        return names
 
     def _name(self, star: int, first_body: int) -> str:
         if star >= first_body:
@@ -242,15 +241,20 @@ def split_by_rate(
     The first are `stars` itself where no star is fainter.
     """
     is_bright = stars.electrons_per_s * drive >= faintest_e_per_s
-    return stars if is_bright.all() else _selected(stars, is_bright), _selected(stars, ~is_bright)
+    faint = _selected(stars, ~is_bright)
+    if is_bright.all():
+        return stars, faint
+    return _selected(stars, is_bright), faint
 
 
-def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
-    grid = cell_grid(stars.vectors[kept])
-    order = np.flatnonzero(kept)[grid.order]
-    columns = {
-        name: values[order] for name in COLUMNS if (values := getattr(stars, name)) is not None
-    }
+def _selected(stars: Stars, is_selected: npt.NDArray[np.bool_]) -> Stars:
+    grid = cell_grid(stars.vectors[is_selected])
+    order = np.flatnonzero(is_selected)[grid.order]
+    columns = {}
+    for name in COLUMNS:
+        values = getattr(stars, name)
+        if values is not None:
+            columns[name] = values[order]
     vectors = np.asfortranarray(stars.vectors[order])
     return replace(
         stars, **columns, vectors=vectors, grid=grid, velocity_km_s=None, bodies=(), air=None

@@ -65,9 +65,8 @@ def colours(
     light = vega()
     colour_by_name: dict[str, Colour] = {}
     for band in BANDS:
-        passband = read_curve_csv(
-            DATA_DIR / ("gaia-g.csv" if band == "g" else f"bessell-{band}.csv")
-        )
+        file_name = "gaia-g.csv" if band == "g" else f"bessell-{band}.csv"
+        passband = read_curve_csv(DATA_DIR / file_name)
         # Gaia's G counts photons, and Vega scaled to V = 0 has G = 0.
         weighting = "photon" if band == "g" else "energy"
         zero = curve_mean(light, passband, weighting) / curve_mean(light, johnson_v)
@@ -90,15 +89,10 @@ def _band(
     response = passband(nodes_nm) * weight_m * (nodes_nm if weighting == "photon" else 1.0)
 
     def log_mean(inverse_k: FloatArray) -> FloatArray:
-        mean = (
-            blackbody_exitance_w_m2_m(nodes_nm, 1.0 / inverse_k[..., None])
-            @ response
-            / response.sum()
-        )
-        return np.asarray(
-            np.log(mean / electrons.v_band_mean_w_m2_m(1.0 / inverse_k, "energy") / zero),
-            dtype=np.float64,
-        )
+        exitance = blackbody_exitance_w_m2_m(nodes_nm, 1.0 / inverse_k[..., None])
+        mean = exitance @ response / response.sum()
+        v_mean = electrons.v_band_mean_w_m2_m(1.0 / inverse_k, "energy")
+        return np.asarray(np.log(mean / v_mean / zero), dtype=np.float64)
 
     low_k, high_k = electrons.TABLE_RANGE_K
     table = Chebyshev.interpolate(

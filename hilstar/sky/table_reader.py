@@ -271,26 +271,27 @@ def layout_of(
     """
     known = _plain_names(names, roles)
     places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
-    role = {
-        role: known[found]
-        for role, words in roles.items()
-        if (found := next((w for w in words if w in known), None))
-    }
-    magnitudes = tuple(route.roles for route in ROUTES if all(name in role for name in route.roles))
-    found = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED]) + (
-        ", ..." if len(names) > MAX_NAMED else ""
-    )
+    column_of: dict[str, str] = {}
+    for role, synonyms in roles.items():
+        synonym = next((name for name in synonyms if name in known), None)
+        if synonym is not None:
+            column_of[role] = known[synonym]
+    magnitudes = tuple(route.roles for route in ROUTES if column_of.keys() >= set(route.roles))
+    columns = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED])
+    if len(names) > MAX_NAMED:
+        columns += ", ..."
     if not places:
         pairs = ", ".join(f"{ra} and {dec}" for ra, dec in PLACES[:4])
         raise InputError(
-            f"{path}: has no right ascension and declination among its columns ({found}); name them"
-            f" {pairs}"
+            f"{path}: has no right ascension and declination among its columns ({columns}); name"
+            f" them {pairs}"
         )
     if not magnitudes:
         raise InputError(
-            f"{path}: has no magnitude with a colour among its columns ({found}); {COLUMNS_WANTED}"
+            f"{path}: has no magnitude with a colour among its columns ({columns});"
+            f" {COLUMNS_WANTED}"
         )
-    layout = Layout(role, places, magnitudes)
+    layout = Layout(column_of, places, magnitudes)
     small = [name.strip().lower() for name in names]
     for name in layout.needed():
         if small.count(name.strip().lower()) > 1:
@@ -384,12 +385,15 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
     with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         head = file.read(4096)
     kind = kind_of(head[:HEAD_BYTES])
-    if kind == "a gzip file" and is_fits(packed := read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)):
-        return _read_packed_fits(path, packed, roles)
+    if kind == "a gzip file":
+        packed = read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)
+        if is_fits(packed):
+            return _read_packed_fits(path, packed, roles)
     if kind is not None and kind != "a FITS file" and wide_encoding(head) is None:
-        raise cannot_read(
-            path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED
-        )
+        advice = FILE_WANTED
+        if kind.endswith("zip file"):
+            advice = "unpack it first"
+        raise cannot_read(path, f"it is {kind}", advice)
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     if kind == "a FITS file":
         return _read_fits(path, path, roles)
@@ -633,12 +637,13 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
             return texts
         return np.where(mask, b"", texts)
     whole = name in {layout.role.get(role) for role in Whole}
-    if values.dtype.kind not in "iufb":
+    is_number = values.dtype.kind in "iufb"
+    if not is_number and values.size == 0:
+        raise InputError(f"{path}: has no rows; {FILE_WANTED}")
+    if not is_number:
         raise InputError(
             f"{path}: column {name} is no column of numbers (its first is"
             f" {str(values.flat[0])[:40]!r}); write decimal figures, places in degrees"
-            if values.size
-            else f"{path}: has no rows; {FILE_WANTED}"
         )
     if whole:
         plain = _whole_numbers(values)

@@ -86,10 +86,8 @@ def tabled_light(seen: Sunward) -> TabledLight:
         (i, j + 1, (1 - u) * v),
         (i + 1, j + 1, u * v),
     )
-    value, missing = (
-        np.sum([share * of[row, column] for row, column, share in corners], axis=0)
-        for of in (log_radiance, blank)
-    )
+    value = np.sum([share * log_radiance[row, column] for row, column, share in corners], axis=0)
+    missing = np.sum([share * blank[row, column] for row, column, share in corners], axis=0)
     return TabledLight(np.exp(value), missing < ROUNDING)
 
 
@@ -100,7 +98,7 @@ def _table_17() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """
     lines = BRIGHTNESS.read_text().splitlines()
     lat_deg = np.array([float(name.split("_")[1]) for name in lines[1].split(",")[1:]])
-    rows = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines[2:]])
+    rows = np.genfromtxt(lines[2:], delimiter=",")  # an empty cell is NaN
     dlon_deg = rows[:, 0]
     log_radiance = np.log(rows[:, 1:])
     blank = np.isnan(log_radiance)

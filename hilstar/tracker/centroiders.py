@@ -28,7 +28,7 @@ FIRST_STEPS = 3  # steps with a window before a fit
 PACE = 1.5
 SETTLED_PX = 1e-6
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
-BOX_SHARE = 0.02
+BOX_SHARE = 0.02  # of its brightest pixel: darker ones do not count in a box
 BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}
 MIN_LIGHT = 1e-30
 SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
@@ -173,6 +173,18 @@ def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
     return x, y
 
 
+def _products(profile: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sums along a side of shares and their slopes (n, 2, side): shares squared, shares times
+    slopes, and slopes squared.
+    """
+    share, slope = profile[:, 0], profile[:, 1]
+    return (
+        np.einsum("ns,ns->n", share, share),
+        np.einsum("ns,ns->n", share, slope),
+        np.einsum("ns,ns->n", slope, slope),
+    )
+
+
 def _fit_step(
     seen: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray
 ) -> FloatArray:
@@ -181,10 +193,8 @@ def _fit_step(
     `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows,
     `seen` (n, 2, 2) the square's sums under their products.
     """
-    (xx, xd, dd), (yy, yd, ee) = (
-        [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))]
-        for part in (across, down)
-    )
+    xx, xd, dd = _products(across)
+    yy, yd, ee = _products(down)
     star_and_slopes = flux * yy * xd, flux * yd * xx  # the star with its slopes
     normal = np.stack(
         [

@@ -352,9 +352,9 @@ def squares(
 def _refine(
     image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings
 ) -> tuple[FloatArray, FloatArray]:
-    return (_gaussian_centres if settings.window == "gaussian" else _plain_centres)(
-        image, level, blobs, settings
-    )
+    if settings.window == "gaussian":
+        return _gaussian_centres(image, level, blobs, settings)
+    return _plain_centres(image, level, blobs, settings)
 
 
 def _gaussian_centres(
@@ -375,11 +375,12 @@ def _gaussian_centres(
         total = weighted.sum(axis=(1, 2))
         lost |= total <= 0
         total = np.where(lost, 1.0, total)
-        first, second = (
-            np.stack([(weighted * offset**power).sum(axis=(1, 2)) for offset in (dx, dy)]) / total
-            for power in (1, 2)
+        first_px = np.stack([(weighted * dx).sum(axis=(1, 2)), (weighted * dy).sum(axis=(1, 2))])
+        second_px2 = np.stack(
+            [(weighted * dx**2).sum(axis=(1, 2)), (weighted * dy**2).sum(axis=(1, 2))]
         )
-        step = first / np.maximum(1 - second / sigma2, MIN_SLOPE)
+        slope = 1 - second_px2 / total / sigma2
+        step = first_px / total / np.maximum(slope, MIN_SLOPE)
         moved = np.where(lost, start, place + step)
         lost |= (np.abs(moved - start) > settings.radius_px).any(axis=0)
         moved = np.where(lost, start, moved)

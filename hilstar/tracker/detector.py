@@ -32,7 +32,7 @@ from hilstar.basics.errors import InputError
 from hilstar.tracker.frame_noise import Word64Array, draw_blocks, normal_pairs, poisson
 from hilstar.tracker.settings import MAX_E, DetectorSettings, PixelPitch, check_value
 
-DEFAULT_PITCH_UM = 13.0
+DEFAULT_PITCH_UM = 13.0  # the CCD47-20's
 MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
 # A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a
@@ -40,7 +40,7 @@ MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 # alone, without Landau's tail.
 RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
-RAY_STEP_PX = 0.25
+RAY_STEP_PX = 0.25  # along a track, so that no pixel that it crosses is passed over
 
 FALSE_STAR_REACH_SIGMAS = 5.0
 CodeArray = npt.NDArray[np.uint16]
@@ -162,8 +162,9 @@ class Detector:
         self.column_e: ChargeArray = (
             settings.column_noise_e * column.standard_normal(width)
         ).astype(kind)
+        offset_shape = self.shape if settings.dsnu_e else 0
         self.offset_map_e: ChargeArray = (
-            settings.dsnu_e * offset.standard_normal(self.shape if settings.dsnu_e else 0)
+            settings.dsnu_e * offset.standard_normal(offset_shape)
         ).astype(kind)
 
     def expose(
@@ -186,9 +187,10 @@ class Detector:
         if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
             rays_e = cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         codes = np.empty(self.shape, dtype=np.uint16)
-        spilt_e, normal = (
-            np.empty(self.shape if settings.blooming else 0, dtype=np.float32) for _ in range(2)
-        )
+        # charge spills over the whole frame: without blooming, parts need none of the others
+        spilt_shape = self.shape if settings.blooming else 0
+        spilt_e = np.empty(spilt_shape, dtype=np.float32)
+        normal = np.empty(spilt_shape, dtype=np.float32)
 
         def draw(part: slice, words: Word64Array) -> None:
             expected_e: Float32Array = light_e[part].astype(np.float32)
@@ -232,11 +234,11 @@ class Detector:
         collected_e = rng.poisson(expected_e).astype(np.float64)
         if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
             collected_e += cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
-        kept_e = self._fill_wells(collected_e)
-        return self._read_out(
-            kept_e,
-            rng.standard_normal(self.shape, dtype=np.float32) if settings.electronics_e else None,
-        )
+        well_e = self._fill_wells(collected_e)
+        normal = None
+        if settings.electronics_e:
+            normal = rng.standard_normal(self.shape, dtype=np.float32)
+        return self._read_out(well_e, normal)
 
     def _read_out(
         self, charge_e: ChargeArray, normal: Float32Array | None, part: slice = slice(None)

@@ -95,11 +95,9 @@ def poisson(
     if not large_count:
         return _by_table(mean_e, normal)
     if large_count == mean_e.size:
-        return _by_expansion(
-            mean_e,
-            normal,
-            max(TABLE_BELOW_E, float(mean_e.min()) if smallest_e is None else smallest_e),
-        )
+        if smallest_e is None:
+            smallest_e = float(mean_e.min())
+        return _by_expansion(mean_e, normal, max(TABLE_BELOW_E, smallest_e))
     # The many all at once, and the few again by themselves.
     if large_count < mean_e.size / 2:
         large = np.flatnonzero(is_large)
@@ -263,18 +261,24 @@ def draw_blocks(
 
     def draw_block(first: int) -> None:
         stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence((key, first))))
-        whole = first + 2 * rows <= height
-        for top in (first,) if whole else range(first, height, rows):
-            part = slice(top, min(top + (2 * rows if whole else rows), height))
+        # A whole block is drawn at once, as two parts; the image's end part by part.
+        end = min(first + 2 * rows, height)
+        if end == first + 2 * rows:
+            parts, step = 2, 2 * rows
+        else:
+            parts, step = 1, rows
+        for top in range(first, end, step):
+            part = slice(top, min(top + step, height))
             words = stream.integers(-(2**63), 2**63, size=(part.stop - top) * width, dtype=np.int64)
-            draw(part, words.reshape(2 if whole else 1, -1, width))
+            draw(part, words.reshape(parts, -1, width))
 
     blocks = range(0, height, 2 * rows)
-    asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
-    threads = min(
-        len(blocks),
-        int(asked) if asked.isdecimal() and int(asked) else len(os.sched_getaffinity(0)),
-    )
+    max_threads = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    if max_threads.isdecimal() and int(max_threads):
+        threads = int(max_threads)
+    else:
+        threads = len(os.sched_getaffinity(0))
+    threads = min(len(blocks), threads)
     if threads == 1:
         for first in blocks:
             draw_block(first)

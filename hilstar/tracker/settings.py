@@ -202,6 +202,12 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         return self.bayer is not None and self.solver_image == "superpixel"
 
     @property
+    def saturation_dn(self) -> float:
+        """The level at which a pixel saturates: the ADC's last code, or the full well, DN."""
+        full_well_dn = self.offset_dn + self.full_well_e / self.gain_e_per_dn
+        return min(2.0**self.bits - 1, full_well_dn)
+
+    @property
     def dark_factor(self) -> float:
         """What the temperature does to dark rates: 1 at the reference temperature (thesis eq.
         4.12).
@@ -262,13 +268,15 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """
         light = np.asarray(light_e, dtype=np.float64)
         seconds = self.dark_factor * exposure_s
+        quantisation_e2 = self.gain_e_per_dn**2 / 12
+        if self.quantisation_noise:
+            quantisation_e2 += self.adc_noise_e**2
         return PixelNoise(
             shot_e2=light,
             dark_e2=self.dark_e_per_s * seconds,
             read_e2=self.read_noise_now_e**2,
             reset_e2=self.reset_noise_e**2,
-            quantisation_e2=self.gain_e_per_dn**2 / 12
-            + (self.adc_noise_e**2 if self.quantisation_noise else 0.0),
+            quantisation_e2=quantisation_e2,
             prnu_e2=(self.prnu * light) ** 2,
             dsnu_e2=math.hypot(self.dsnu_e_per_s, self.column_dark_e_per_s) ** 2 * seconds**2
             + self.column_noise_e**2
@@ -280,11 +288,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """Sigma of what the electronics add to the charge: read and reset noise, and the ADC's
         for `quantisation_noise`.
         """
-        return math.hypot(
-            self.read_noise_now_e,
-            self.reset_noise_e,
-            self.adc_noise_e if self.quantisation_noise else 0.0,
-        )
+        adc_noise_e = self.adc_noise_e if self.quantisation_noise else 0.0
+        return math.hypot(self.read_noise_now_e, self.reset_noise_e, adc_noise_e)
 
     @property
     def adc_noise_e(self) -> float:
@@ -343,9 +348,8 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
         )
         mean = shape * math.exp(float(np.log(rate / gammaincinv(shape, share)).mean()))
         return mean, mean / math.sqrt(shape)
-    slope, middle = map(
-        float, np.polyfit(ndtri(share), rate if law == "normal" else np.log(rate), 1)
-    )
+    normal_rate = rate if law == "normal" else np.log(rate)
+    slope, middle = np.polyfit(ndtri(share), normal_rate, 1).tolist()
     if law == "normal":
         if middle < 0:
             raise InputError(

@@ -25,12 +25,12 @@ from hilstar.tracker.centroiders import (
 
 # a pixel's width twice: a star is sampled by squares, and shown by squares
 SQUARES_VARIANCE = 1 / 6
-REACH_SIGMAS = 5.0
+REACH_SIGMAS = 5.0  # of a star, where it is looked at: beyond lie 6e-7 of a Gaussian
 BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centre
 # Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
-GOLDEN = 0.6180339887498949
+GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
 MIN_BLUR_PX = 1e-3
 
 
@@ -212,24 +212,24 @@ def stamp_errors(
         )
         return rows @ images @ columns.transpose(0, 2, 1)
 
-    half = max(BOX_SIDE // 2, math.ceil(side / 2 / sampled_px))
-    whole, boxed = (
-        [seen(images, *how) for images in (wanted, shown)]
-        for how in ((sampled_px, half), (pixel_px, BOX_SIDE // 2))
-    )
+    # Centroiders of a box see the tracker's pixels in it; all others the whole star.
+    box_half = BOX_SIDE // 2
+    boxed = seen(wanted, pixel_px, box_half), seen(shown, pixel_px, box_half)
+    half = max(box_half, math.ceil(side / 2 / sampled_px))
+    whole = seen(wanted, sampled_px, half), seen(shown, sampled_px, half)
     middle = np.full(count, half)
+    is_lit = shown.sum(axis=(1, 2)) > 0
     off_px: dict[Centroider, FloatArray] = {}
     for kind in FAMILY:
-        views, width_px, pixels = (
-            (boxed, pixel_px, brightest(boxed[0]))
-            if kind in BOXES
-            else (whole, sampled_px, (middle, middle))
-        )
+        if kind in BOXES:
+            views, width_px, pixels = boxed, pixel_px, brightest(boxed[0])
+        else:
+            views, width_px, pixels = whole, sampled_px, (middle, middle)
         there, here = (
             np.stack(star_places(view, kind, (x, y), pixels, box_share)) * width_px
             for view in views
         )
-        off_px[kind] = np.where(shown.sum(axis=(1, 2)) > 0, here - there, np.inf)
+        off_px[kind] = np.where(is_lit, here - there, np.inf)
     return off_px
 
 

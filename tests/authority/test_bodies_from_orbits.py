@@ -16,15 +16,13 @@ from hilstar.sky.bodies.light import SUN_V_MAG, moon_v_mag, phase_angle_deg
 from hilstar.sky.bodies.moving import PLANETS
 from hilstar.sky.bodies.oem import OemOrbit
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
+from tests.support.claims import holds
 from tests.support.skies import ALL_BODIES, SKYFIELD_NAMES, moving_sky, random_utcs_ns, skyfield
 from tests.support.stars import stars_at
 
 ARCSEC = np.pi / (180 * 3600)
-PLACE_ARCSEC = 0.1  # the issue's
-# Measured: 0.2, 1.6, 9 and 0.6 mas. Skyfield bends light by the Earth too, and turns elements by
-# the sidereal time of 1982, whose equinox drifts by 0.25 arcsec a century: 24 m of a geostationary
-# orbit in 2046.
-MEASURED_ARCSEC = {"geocentre": 0.001, "low": 0.003, "geostationary": 0.015, "Molniya": 0.002}
+# Skyfield bends light by the Earth too, and turns elements by the sidereal time of 1982, whose
+# equinox drifts by 0.25 arcsec a century: 24 m of a geostationary orbit in 2046.
 # The issue's. Skyfield takes the barycentre for the Sun, which is up to 0.01 au from it: a crescent
 # of Mercury is then 0.2 mag off. With the Sun in its place all are within 0.022, its term for
 # spacecraft at Uranus.
@@ -115,8 +113,9 @@ def test_places_and_magnitudes_on_fifty_dates_of_each_observer_are_skyfield_s(ki
             parallax_deg.append(phase_angle_deg(centre, to_moon))
     # Neptune's before 2000 are open at phases over 1.9 degrees, which it has near quadrature
     assert np.isfinite(off_mag).sum() > DATES * (len(PLANETS) - 1)
-    assert np.max(off_arcsec) < MEASURED_ARCSEC[kind] < PLACE_ARCSEC
-    assert np.nanmax(off_mag) < MAGNITUDE_MAG
+    if kind != "geocentre":  # which has a test of its own
+        holds(f"body-places-{kind}", 1000 * np.max(off_arcsec))
+    holds("planet-magnitudes", np.nanmax(off_mag))
     assert (
         max(mag for mag, name in direct_mag if name != "Mercury" and not np.isnan(mag))
         < MAGNITUDE_MAG

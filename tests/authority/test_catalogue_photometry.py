@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import load_library
 from hilstar.sky.table_reader import bv_from_vi, from_gaia, from_tycho
+from tests.support.claims import holds
 
 HERE = Path(__file__).parent
+DEFAULT_DEPTH_V_MAG = 7.5
 # Mamajek et al. 2002 state 0.006 mag in V and 0.009 in B-V; ground and Tycho scatter by 0.015 and
 # 0.02
 # mag a star, the median of 20 by 0.25 of that. In V they leave 0.015 at the red end, where the
@@ -78,6 +81,12 @@ def test_gaia_magnitudes_become_those_of_the_spectra():
     assert np.abs(v[plain] - np.median(v[plain])).max() < GAIA_STAR_MAG
     assert abs(np.median(vi[plain] - library.vi_mag[plain])) < GAIA_MEDIAN_MAG
     assert np.abs(vi[plain] - library.vi_mag[plain]).max() < GAIA_VI_MAG
+
+
+def test_stars_beyond_the_default_depth_have_so_much_of_the_light():
+    v_mag = load_catalog().v_mag
+    light = 10 ** (-0.4 * v_mag)
+    holds("depth-light", 100 * light[v_mag > DEFAULT_DEPTH_V_MAG].sum() / light.sum())
 
 
 def test_b_less_v_by_v_less_i_is_right_where_rates_depend_on_it():

@@ -23,6 +23,7 @@ from hilstar.optics.paths import node_counts, nodes_of
 from hilstar.optics.sprites import pack_sprites
 from hilstar.server.bench.build import load
 from tests.support.benches import bench_text
+from tests.support.claims import holds
 
 SIZE_PX, STEP_PX, HALF_PX = (960, 540), 30, 12
 FRAMES = 3  # of 540 stars each
@@ -333,3 +334,49 @@ def test_the_claim_of_a_turn_too_slow_for_paths_is_what_its_frames_have(bits, tm
             for kind, place in here.items():
                 off_px = max(off_px, np.hypot(*(place - there[kind])).max())
         assert off_px <= bench.effort.error_px <= MOST * off_px
+
+
+# Bits and codes of the table in docs/accuracy-speed.md, and its turns
+TURNING = [(8, "exact"), (10, "round"), (16, "round")]
+TURNS_DEG_S = (1, 5, 10)
+
+
+def hold_turns(bench, bits, rng):
+    """The worst light and place of stars in each turn; of windows, which find no place along a path
+    of several pixels, apart.
+    """
+    path_px = math.radians(1.0) * bench.scan.hold_s * bench.camera.focal_length_px
+    holds("turning-path", path_px)
+    for turn_deg_s in TURNS_DEG_S:
+        flux_mag, off_px = worst_errors(bench, "srgb", 0.85, rng, turn_deg_s * path_px)
+        holds(f"turning-{bits}-{turn_deg_s}-mag", flux_mag)
+        if turn_deg_s > 1:
+            holds(f"turning-{bits}-{turn_deg_s}-windows", off_px.pop("window"))
+        place_px = max(off_px.values())
+        holds(f"turning-{bits}-{turn_deg_s}-px", place_px)
+        if turn_deg_s == 1:
+            assert flux_mag <= bench.effort.error_mag and place_px <= bench.effort.error_px
+
+
+@pytest.mark.parametrize(("bits", "codes"), TURNING)
+def test_the_table_of_turning_stars_has_what_they_have(bits, codes, tmp_path, rng):
+    path = tmp_path / "bench.toml"
+    changed = {"monitor": {"bits": bits}, "render": {"quantisation": codes, "motion": "on"}}
+    path.write_text(bench_text(FRAME, changed))
+    with load(path) as bench:
+        holds(f"turning-{bits}-claimed-mag", bench.effort.error_mag)
+        holds(f"turning-{bits}-claimed-px", bench.effort.error_px)
+        hold_turns(bench, bits, rng)
+
+
+def test_readme_s_bench_at_rest_is_within_what_is_claimed(tmp_path, rng):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(FRAME, {"render": {"quantisation": "exact", "motion": "off"}}))
+    with load(path) as bench:
+        flux_mag, off_px = worst_errors(bench, "srgb", 0.85, rng)
+        claimed = bench.effort
+        assert flux_mag <= claimed.error_mag <= MOST * flux_mag
+        assert max(off_px.values()) <= claimed.error_px <= MOST * max(off_px.values())
+        holds("rest-8-claimed-mag", claimed.error_mag)
+        holds("rest-8-claimed-px", claimed.error_px)
+        holds("slow-turn-px", bench.config.render.motion_above_px / 3)

@@ -24,6 +24,7 @@ from tests.authority.failing_methods import (
     field,
     sky,
 )
+from tests.support.claims import holds
 
 CASES = (*CATALOGUE_AND_GEOMETRY, *DETECTOR_AND_ATTITUDE)
 # A failing method's figure is no matter of rounding; hilstar's own is, and is held by its
@@ -134,3 +135,8 @@ def test_weak_perspective_errs_by_half_the_angle_cubed():
     angle = math.radians(3.0)
     assert off_px[0] == pytest.approx(-350e3 / 57.65 * angle**3 / 2, rel=2e-3)
     assert off_arcsec[0] == pytest.approx(-math.degrees(angle**3 / 2) * 3600, rel=6e-3)
+    far_px = field.weak_perspective_error(np.array([10.0]))[0][0]
+    wide = math.radians(10.0)
+    assert far_px == pytest.approx(-350e3 / 57.65 * (math.tan(wide) - math.sin(wide)), rel=1e-9)
+    holds("weak-perspective", -far_px)
+    holds("weak-perspective-5", -field.weak_perspective_error(np.array([5.0]))[0][0])

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.star_size import star_size
 from tests.support.benches import ROOT, bench_text
+from tests.support.claims import holds
 
 SPRITE_PX = 0.85
 # of the grid: the midpoint rule is off by a 24th of its squared step times curvatures of under 10 /
@@ -80,9 +81,19 @@ def found_of(text: str, folder):
     return file.config, star_size(file.config, folder, camera), camera
 
 
-@pytest.mark.parametrize("text", [NEWCOMER, README, FINE], ids=["newcomer", "readme", "fine"])
-def test_a_star_is_as_wide_as_the_integral_over_its_pixels_says(tmp_path, text):
-    config, found, camera = found_of(text, tmp_path)
+# the benches of the table in docs/twin.md, and one with a wider star
+BENCHES = {"newcomer": NEWCOMER, "readme": README, "fine": FINE}
+TOLD = ("demo", "microdisplay", "monitor-10bit", "office-8bit")
+
+
+@pytest.mark.parametrize("name", [*BENCHES, *TOLD])
+def test_a_star_is_as_wide_as_the_integral_over_its_pixels_says(tmp_path, name):
+    if name in TOLD:
+        file = read_bench_file(ROOT / "configs" / f"{name}.toml")
+        config, camera = file.config, bench_camera(file.config, file.folder)
+        found = star_size(config, file.folder, camera)
+    else:
+        config, found, camera = found_of(BENCHES[name], tmp_path)
     lens_px = config.tracker.psf_sigma_px[0]
     tracker_px_a_rad = config.tracker.focal_length_mm * 1e3 / config.tracker.pixel_pitch_um
     ratio = tracker_px_a_rad / camera.focal_length_px
@@ -98,6 +109,10 @@ def test_a_star_is_as_wide_as_the_integral_over_its_pixels_says(tmp_path, text):
     )
     assert found.shared_px == pytest.approx(shared, rel=5 * POINTS_ERROR)
     assert found.sky_shared_px == pytest.approx(sky_shared, rel=5 * POINTS_ERROR)
+    if name in ("newcomer", *TOLD):
+        holds(f"width-{name}", found.sigma_px)
+        holds(f"width-{name}-ratio", found.sigma_ratio)
+        holds(f"width-{name}-peak", found.peak_loss_mag)
 
 
 def test_the_two_benches_have_the_figures_that_were_worked_out_by_hand(tmp_path):

@@ -14,9 +14,11 @@ from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.bench.star_rates import bench_channels
-from hilstar.sky.spectrum import DATA_DIR, Curve
+from hilstar.sky.electrons import Optics
+from hilstar.sky.spectrum import DATA_DIR, Curve, load_curve
 from tests.authority.integrals import read
 from tests.support.benches import ORION_Q, bench_text
+from tests.support.claims import holds
 
 NM = np.arange(350.0, 1051.0, 10.0)
 FINE_NM = np.arange(300.0, 1100.01, 0.25)
@@ -131,6 +133,34 @@ def test_the_mosaics_mean_image_has_a_quarter_of_red_and_blue_and_half_of_green(
     np.testing.assert_allclose(found, np.array(wanted) * [0.25, 0.5, 0.25], rtol=QUADRATURE)
 
 
+def spectra():
+    """Wavelengths, fluxes and types of the library, as its file has them."""
+    with np.load(DATA_DIR / "pickles.npz") as packed:
+        return (
+            packed["wavelength_nm"].astype(float),
+            packed["flux"].astype(float),
+            packed["spectral_type"],
+        )
+
+
+def test_the_near_infrared_of_a_bare_sensor_is_the_librarys_own():
+    glass = load_curve("n-bk7-10mm", "transmission")
+    (row,) = red_shares({"all": Optics(30.0, load_curve("ccd47-20", "qe"), glass)}, [700.0])
+    nm, flux, kinds = spectra()
+    sensitivity = FINE_NM * np.prod(
+        [np.interp(FINE_NM, *read(name), left=0, right=0) for name in ("n-bk7-10mm", "ccd47-20")],
+        axis=0,
+    )
+    for one in "GM":
+        light = [
+            np.interp(FINE_NM, nm, spectrum) * sensitivity
+            for spectrum in flux[[str(kind).startswith(one) for kind in kinds]]
+        ]
+        shares = [part[FINE_NM >= 700].sum() / part.sum() for part in light]
+        assert row["by_class"][one] == pytest.approx(np.mean(shares), abs=BUDGET)
+        holds(f"infrared-{one.lower()}", 100 * row["by_class"][one])
+
+
 def test_the_budgets_near_infrared_is_the_librarys_own(sensor):
     folder, channels = sensor
     power = np.exp(-(((NM - 600) / 40) ** 2))  # 1 % of it at 686 nm
@@ -140,12 +170,7 @@ def test_the_budgets_near_infrared_is_the_librarys_own(sensor):
     rows = red_shares(optics, [700.0, reddest_nm(primaries)])
     found = {(row["channel"], row["from_nm"]): row["by_class"] for row in rows}
     assert {nm for _, nm in found} == {700.0, 680.0} and len(found) == 8
-    with np.load(DATA_DIR / "pickles.npz") as packed:
-        nm, flux, kinds = (
-            packed["wavelength_nm"].astype(float),
-            packed["flux"].astype(float),
-            packed["spectral_type"],
-        )
+    nm, flux, kinds = spectra()
     glass = np.interp(FINE_NM, *read("n-bk7-10mm"), left=0, right=0)
     for name, efficiency in (("all", sum(channels)), ("quantum_efficiency_r", channels[0])):
         for one in "OBAFGKM":

@@ -32,7 +32,7 @@ from hilstar.instruments.study.speed.tracker import tracker_rows
 from hilstar.server.bench.build import open_bench
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FrameRecord
-from hilstar.server.record.report import figures_of
+from hilstar.server.record.run_figures import figures_of
 from tests.support.benches import ROOT
 
 HILSTAR = (sys.executable, "-m", "hilstar")

@@ -5,6 +5,7 @@ catalogue agrees with.
 from __future__ import annotations
 
 import json
+import re
 
 import matplotlib
 import numpy as np
@@ -22,7 +23,10 @@ def cells() -> list[str]:
     code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     # None is kept, so that none is stale.
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
-    return ["".join(cell["source"]) for cell in code]
+    sources = ["".join(cell["source"]) for cell in code]
+    # the facade alone: no command, no module of hilstar's
+    assert re.findall(r"hilstar\.\w+|subprocess", " ".join(sources)) == ["hilstar.load"]
+    return sources
 
 
 def test_its_cells_run_from_the_bench_file_to_the_plots(tmp_path, monkeypatch, capsys, cells):

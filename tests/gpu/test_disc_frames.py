@@ -15,7 +15,7 @@ from skyfield.api import Star
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.quantise import dither_levels, mask_turn, round_levels
 from hilstar.display.render.disc_tiles import disc_tiles
-from hilstar.display.render.extended import ExtendedLayer
+from hilstar.display.render.extended_drawing import ExtendedLayer
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target

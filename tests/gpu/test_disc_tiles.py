@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import hilstar.display.render.extended as layer
+import hilstar.display.render.extended_drawing as layer
 from hilstar.basics.units import KM_PER_AU
 from hilstar.display.quantise import dither_levels, round_levels
 from hilstar.display.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles

@@ -4,11 +4,13 @@ tracker that watches it, its GigE Vision camera, and Aravis that takes the image
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 
 import pytest
 
+from hilstar.server.bench.config.hardware import DEFAULT_PSF_SIGMA_PX
 from hilstar.server.genicam.camera import has_aravis
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import run_hilstar
@@ -21,20 +23,47 @@ from tests.support.waiting import PATIENCE_S
 TRUE_FOCAL_MM = 121.0
 
 
-def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(screen, tmp_path):
-    if not has_aravis():
-        pytest.skip("Aravis is not installed (gir1.2-aravis-0.8, python3-gi)")
-    bench = tmp_path / "bench.toml"
+MAX_NOISE_PX = 0.02  # of a dot's place in an image of the virtual tracker
+SIGMAS = 4.0
+
+
+def benches(folder):
+    """The bench file, and the truth that the virtual tracker looks through."""
+    bench, truth = folder / "bench.toml", folder / "truth.toml"
     bench.write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
-    truth = tmp_path / "truth.toml"
-    truth.write_text(
-        bench_text(TWIN, {"monitor": {"bits": 8}, "collimator": {"focal_length_mm": TRUE_FOCAL_MM}})
-    )
-    address, endpoint = own_address(), f"tcp://127.0.0.1:{free_port()}"
-    watcher = [*HILSTAR, "tracker", truth, "--watch", endpoint, "--camera", address, "--json"]
+    true = {"monitor": {"bits": 8}, "collimator": {"focal_length_mm": TRUE_FOCAL_MM}}
+    truth.write_text(bench_text(TWIN, true))
+    return bench, truth
+
+
+@contextlib.contextmanager
+def virtual_camera(truth, endpoint):
+    """The virtual tracker's camera before what is shown at the endpoint: its address, and what it
+    prints at the end.
+    """
+    address = own_address()
+    command = [*HILSTAR, "tracker", truth, "--watch", endpoint, "--camera", address, "--json"]
     with Started(
-        list(map(str, watcher)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as tracker:
+
+        def ended():
+            tracker.terminate()
+            return tracker.communicate(timeout=PATIENCE_S)
+
+        yield address, ended
+
+
+needs_aravis = pytest.mark.skipif(
+    not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8, python3-gi)"
+)
+
+
+@needs_aravis
+def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(screen, tmp_path):
+    bench, truth = benches(tmp_path)
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    with virtual_camera(truth, endpoint) as (address, ended):
         result = run_hilstar(
             "first-light",
             bench,
@@ -52,8 +81,7 @@ def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(scre
             env=screen.env,
             timeout=4 * PATIENCE_S,
         )
-        tracker.terminate()
-        told, err = tracker.communicate(timeout=PATIENCE_S)
+        told, err = ended()
     assert result.returncode == 0, (result.stderr, err)
     camera = json.loads(told)["camera"]
     assert camera["images"] > 10 and camera["dropped"] == 0
@@ -61,3 +89,64 @@ def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(scre
     focal_px = steps["geometry"]["figures"]["focal_length_px"]
     assert focal_px == pytest.approx(TRUE_FOCAL_MM * 1e3 / 57.65, rel=1e-3)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.1
+    # The twin agrees: of the true collimator the bench passes now, and did not before.
+    for file, code in ((tmp_path / "s" / "bench-before.toml", 1), (bench, 0)):
+        judged = tmp_path / f"judged-{code}.toml"
+        text = file.read_text()
+        judged.write_text(f"{text}\n[verify]\ntrue_focal_length_mm = {TRUE_FOCAL_MM}\n")
+        verified = run_hilstar("verify", judged, "--fields", "3", "--strict")
+        assert verified.returncode == code, (verified.stdout, verified.stderr)
+
+
+@needs_aravis
+def test_geometry_and_psf_are_calibrated_by_dots_that_a_camera_takes(screen, tmp_path):
+    bench, truth = benches(tmp_path)
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    plan = tmp_path / "plan"
+    planned = run_hilstar("calibrate", "dots", bench, "-o", plan, "--frames", "10", "--dots", "25")
+    assert planned.returncode == 0, planned.stderr
+    with virtual_camera(truth, endpoint) as (address, ended):
+        words = ("--plan", plan, "--grab", f"genicam:{address}", "--feed", endpoint, "--json")
+        geometry = run_hilstar(
+            "calibrate",
+            "geometric",
+            bench,
+            "-o",
+            tmp_path / "geometry.toml",
+            "--tracker-is-ideal",
+            *words,
+            env=screen.env,
+        )
+        told, err = ended()
+    assert geometry.returncode == 0, (geometry.stderr, err)
+    assert json.loads(told)["camera"]["dropped"] == 0
+    found = json.loads(geometry.stdout)
+    assert "its dots saturate the tracker" in geometry.stderr
+    assert found["noise_px"] < MAX_NOISE_PX and found["centroids"]["false"] == 0
+    fitted = found["parameters"]["focal_length_px"]
+    off_px = abs(fitted["value"] - TRUE_FOCAL_MM * 1e3 / 57.65)
+    assert off_px < SIGMAS * fitted["sigma"] < 0.5
+    images = sorted((plan / "images").glob("frame_*.png"))
+    words = ("--plan", plan, "-o", tmp_path / "psf.fits", "--json")
+    psf = run_hilstar("calibrate", "psf", bench, *images, *words)
+    assert psf.returncode == 0, psf.stderr
+    assert json.loads(psf.stdout)["sigma_px"] == pytest.approx(DEFAULT_PSF_SIGMA_PX, rel=0.01)
+
+
+@needs_aravis
+def test_a_bench_is_checked_against_its_file_through_a_camera(screen, tmp_path):
+    """The truth's collimator is 1 mm longer than the bench file's: the check tells it."""
+    bench, truth = benches(tmp_path)
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    with virtual_camera(truth, endpoint) as (address, ended):
+        words = ("--check", "--grab", f"genicam:{address}", "--feed", endpoint, "--json")
+        checked = run_hilstar(
+            "certify", bench, "-o", tmp_path / "c", *words, env=screen.env, timeout=8 * PATIENCE_S
+        )
+        told, err = ended()
+    assert checked.returncode == 1, (checked.stderr, err)
+    assert json.loads(told)["camera"]["dropped"] == 0
+    figures = {figure["quantity"]: figure for figure in json.loads(checked.stdout)["figures"]}
+    assert {name for name in figures if not figures[name]["in_tolerance"]} == {"scale"}
+    scale = figures["scale"]
+    assert scale["value"] == pytest.approx(1e6 * (120 / TRUE_FOCAL_MM - 1), abs=scale["threshold"])

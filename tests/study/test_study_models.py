@@ -20,7 +20,7 @@ from hilstar.instruments.study.models import (
     zero_points,
 )
 from hilstar.instruments.study.rapp import rapp_ratios
-from hilstar.instruments.study.settings import held_out_errors, study_optics
+from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles

@@ -8,18 +8,22 @@ import ipaddress
 import itertools
 import os
 import re
+import select
 import socket
 import struct
+import time
 from typing import Self
 
 import numpy as np
 
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, wait_for
 
 PORT = 3956
 DISCOVER, READ, WRITE, READ_MEMORY, RESEND = 0x0002, 0x0080, 0x0082, 0x0084, 0x0040
 PRIVILEGE, STREAM_PORT, PACKET_BYTES, STREAM_ADDRESS = 0x0A00, 0x0D00, 0x0D04, 0x0D18
 CONTROL = 2
+HEARTBEAT_S = 1.0  # a camera lets a client go that it has not heard for 3 s
+AGAIN_S = 0.05  # between two requests for packets that were lost
 
 
 # Each process of tests has addresses of its own: a camera's port is fixed.
@@ -55,6 +59,10 @@ class GigEClient:
         self.stream.bind((own, 0))
         self.stream.settimeout(PATIENCE_S)
         self._number = 0
+        self._blocks: dict[int, dict[int, bytes]] = {}  # that are coming, by their numbers
+        self._last: dict[int, int] = {}  # their trailers' packets
+        self._newest = 0
+        self._asked_s = self._heard_s = 0.0
         self.registers: dict[str, int] = {}
 
     def __enter__(self) -> Self:
@@ -66,6 +74,7 @@ class GigEClient:
 
     def ask(self, kind: int, body: bytes = b"") -> tuple[int, bytes]:
         """The status and the body of an answer."""
+        self._heard_s = time.monotonic()
         self._number = self._number % 0xFFFF + 1
         self.socket.sendto(command(kind, body, self._number), (self.address, PORT))
         while True:
@@ -115,24 +124,75 @@ class GigEClient:
         return self.write(self.registers[feature], value)
 
     def block(self) -> tuple[int, int, dict[int, bytes]]:
-        """The next image: its number, timestamp, and its packets by their number."""
-        packets: dict[int, bytes] = {}
-        last = stamp = None
-        while last is None or len(packets) < last + 1:
-            data = self.stream.recv(65536)
-            status, number, kind_and_packet = struct.unpack(">HHI", data[:8])
-            assert status == 0
-            packet, kind = kind_and_packet & 0xFF_FFFF, kind_and_packet >> 24
-            packets[packet] = data[8:]
-            if kind == 1:
-                stamp = struct.unpack(">Q", data[12:20])[0]
-            if kind == 2:
-                last = packet
-        assert stamp is not None
-        return number, stamp, packets
+        """The next image: its number, timestamp, and its packets by their number. Those that were
+        lost on the way are asked for again.
+        """
+        end_s = time.monotonic() + PATIENCE_S
+        while not (self._blocks and self._missing(oldest := min(self._blocks)) is None):
+            assert time.monotonic() < end_s, "no image came"
+            if time.monotonic() > self._heard_s + HEARTBEAT_S:
+                self.read(PRIVILEGE)
+            ready, _, _ = select.select([self.stream], [], [], AGAIN_S)
+            if ready:
+                self._receive()
+            if self._blocks and (not ready or self._is_late(min(self._blocks))):
+                self._ask_again(min(self._blocks))
+        packets = self._blocks.pop(oldest)
+        return oldest, struct.unpack(">Q", packets[0][4:12])[0], packets
+
+    def _receive(self) -> None:
+        data = self.stream.recv(65536)
+        status, number, kind_and_packet = struct.unpack(">HHI", data[:8])
+        if status:  # the camera has this block no more
+            self._blocks.pop(number, None)
+            return
+        packet, kind = kind_and_packet & 0xFF_FFFF, kind_and_packet >> 24
+        if number > self._newest:
+            self._newest = number
+            self._blocks[number] = {}
+        if number not in self._blocks:  # a packet that came twice
+            return
+        self._blocks[number][packet] = data[8:]
+        if kind == 2:
+            self._last[number] = packet
+
+    def _missing(self, number: int) -> tuple[int, int] | None:
+        """The first and the last packet of a block that has not come; None where all have."""
+        packets = self._blocks[number]
+        last = self._last.get(number, 0xFF_FFFF)
+        if len(packets) == last + 1:
+            return None
+        first = next(k for k in itertools.count() if k not in packets)
+        return first, max(k for k in range(first, min(last, first + 511) + 1) if k not in packets)
+
+    def _is_late(self, number: int) -> bool:
+        return number in self._last or number < self._newest
+
+    def _ask_again(self, number: int) -> None:
+        if (missing := self._missing(number)) is None or time.monotonic() < self._asked_s + AGAIN_S:
+            return
+        self._asked_s = time.monotonic()
+        body = struct.pack(">HHII", 0, number, *missing)
+        self.socket.sendto(command(RESEND, body, 0xFFFF, flags=0), (self.address, PORT))
 
     def image(self, height: int, width: int, kind: str = "<u2") -> tuple[int, int, np.ndarray]:
         """The next image as DN (height, width), with its number and timestamp."""
         number, stamp, packets = self.block()
         data = b"".join(packets[k] for k in range(1, len(packets) - 1))
         return number, stamp, np.frombuffer(data, kind).reshape(height, width)
+
+
+def opened(client: GigEClient) -> GigEClient:
+    """The client once the camera answers."""
+
+    def answers() -> bool:
+        client.socket.settimeout(0.5)
+        try:
+            client.describe()
+        except OSError:
+            return False
+        return True
+
+    wait_for(answers, "the camera answers")
+    client.socket.settimeout(PATIENCE_S)
+    return client

@@ -14,7 +14,8 @@ from hilstar.server.bench.frame import Bench
 from hilstar.server.loop import Limit
 from hilstar.server.open_link import AnyLink
 from hilstar.server.pacer import Shown
-from hilstar.server.serve import Outlet, Running, serve
+from hilstar.server.run_progress import Running
+from hilstar.server.serve import Outlet, serve
 from hilstar.server.summary import RunSummary
 from tests.support.waiting import PATIENCE_S
 

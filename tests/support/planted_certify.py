@@ -35,7 +35,7 @@ from tests.support.planted_readings import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hilstar.server.bench.certificate import Certificate
+    from hilstar.server.bench.certificate_file import Certificate
 
 NOW = datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)
 

@@ -30,7 +30,7 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.wrong_sky import CLOCK, ENDS
 
-PACE_SLOTS = 9
+PACE_SLOTS = 9  # a quarter of a second each: two seconds from the first to the last
 # twice what a crystal is allowed: beyond it, and steadily, t_ns runs slow or fast
 MIN_ODD_PACE = 0.004
 STEPS = 31
@@ -43,7 +43,7 @@ MIN_LIMIT_NS = 5 * NS_PER_MS
 AGREEMENT_NS = 2 * NS_PER_MS
 UNSETTLED_NS = 100 * NS_PER_MS
 SETTLED_AFTER = 50  # messages, and
-SETTLED_AFTER_NS = 2 * NS_PER_S
+SETTLED_AFTER_NS = 2 * NS_PER_S  # as much time: a burst shows no usual delay
 MAX_DOUBT_NS = 250 * NS_PER_MS
 # How early a message may be against a first guess: one that waited, perhaps for minutes, or one
 # that was read late.

@@ -24,11 +24,11 @@ from hilstar.basics.rotation import conjugate, multiply, rotate, to_rotation_vec
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.wrong_sky import CONVENTION, RATES
 
-MIN_INTERVALS = 5
+MIN_INTERVALS = 5  # between packets, in a stretch that is judged
 MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES = 4, 6, 12
 LONGEST_S = 0.5
 MAX_STEP_RAD = 1.5  # from packet to packet: half a turn has no direction
-MIN_TURN_RAD_S = math.radians(0.01)
+MIN_TURN_RAD_S = math.radians(0.01)  # a slower turn counts as rest, at which rates show nothing
 MIN_OFF_RAD_S, MIN_GROSS_RAD_S = math.radians(0.05), math.radians(1.0)
 OFF_SHARE, FIT_SHARE, AXES_SHARE, GROSS_SHARE = 0.2, 0.1, 0.03, 0.5  # shares of the faster turn
 # maximum share of packets that repeat an attitude: a turn in steps is not the camera's
@@ -37,13 +37,13 @@ OFF_SIGMA, FIT_SIGMA, TURN_SIGMA = 6.0, 4.0, 3.0
 MIN_BETTER = 3.0  # a cause leaves at most a third of the error
 # white noise of rates, summed up: the slope of its sum is off by sqrt(6/5) of its mean's error
 WALK = 1.1
-STEADY_SHARE = 0.2
+STEADY_SHARE = 0.2  # of the fastest turn: one that changes by more makes late rates look wrong
 SHARP_SHARE = 0.25  # the shares of the turn that noise may hide, for another reading
 MUCH_LESS = 0.5
 MIN_HISTORY_S = 3.0
 MAX_LAG_S, LAG_SPAN_S = 0.5, 0.2  # lags that are tried, and the time over which each turn is taken
 LAG_STEPS_S = (0.01, 0.002)  # coarse, then fine
-MIN_LAG_S = 0.02
+MIN_LAG_S = 0.02  # a shorter lag is not named
 MIN_TURNS = 5
 NOISE_RATIO = 2.0  # over ten and more turns a chance error is within 1.5 times the noise
 LAG_TIE = 0.02  # share of the range of errors
@@ -213,12 +213,12 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that
-    multiplies their noise by.
+    """A way in which rates may be wrong: `mends` (3, 3) turns them into right ones, and multiplies
+    their noise by `scale`.
 
-    They are taken to have ICRS components where `in_icrs`, else the camera's. `constant` (3,),
-    rad/s, is added to them all. Where they fit another `reading` of the quaternions, it is the sky
-    that is wrong.
+    Rates have ICRS components where `in_icrs`, else the camera's. `constant` (3,), rad/s, is added
+    to all of them, and `lag_s` is how late they are. Where they fit another `reading` of the
+    quaternions, the quaternions are read wrongly: the sky is wrong, not the rates.
     """
 
     text: str
@@ -285,9 +285,12 @@ def _permutations() -> Iterator[Cause]:
                 continue
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
-            sent = ", ".join(
-                ("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3)
-            )
+            axes_sent = []
+            for camera_axis in range(3):
+                place = order.index(camera_axis)
+                sign = "" if signs[place] > 0 else "-"
+                axes_sent.append(sign + "xyz"[place])
+            sent = ", ".join(axes_sent)
             if order == (0, 1, 2):
                 what = "some of their axes have the wrong sign"
             else:
@@ -438,9 +441,8 @@ def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float)
     """
     if len(stretches) < MORE_STRETCHES:
         return None
-    turns, rates = (
-        np.array([getattr(stretch, name) for stretch in stretches]) for name in ("turn", "rate")
-    )
+    turns = np.array([stretch.turn for stretch in stretches])
+    rates = np.array([stretch.rate for stretch in stretches])
     factor = float((rates * rates).sum()) / float((rates * turns).sum() or math.inf)
     if abs(factor) > 0:
         times = Cause(
@@ -563,10 +565,8 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
     zero_ns = stretches[0].from_ns
     parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
     t_s = np.concatenate([[0.0], *parts])
-    turned, summed = (
-        _joined([getattr(stretch, name) for stretch in stretches])
-        for name in ("turned_rad", "summed_rad")
-    )
+    turned = _joined([stretch.turned_rad for stretch in stretches])
+    summed = _joined([stretch.summed_rad for stretch in stretches])
     edges_s = np.arange(MAX_LAG_S, t_s[-1] - MAX_LAG_S, LAG_SPAN_S)
     if t_s[-1] < MIN_HISTORY_S or len(edges_s) <= MIN_TURNS:
         return None

@@ -74,20 +74,24 @@ def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) ->
     length = _Length(0.0)
     others = tuple(read_otherwise(readings(read_as)))
     for sample in samples:
-        if length.add(sample) and (cause := _first_cause(length, math.inf, others)) is not None:
+        if not length.add(sample):
+            continue
+        cause = _first_cause(length, math.inf, others)
+        if cause is not None:
             return cause
     return None
 
 
 def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -> Cause | None:
-    """What the newest stretches of a length show, few of them first."""
+    """The cause that the newest stretches of a length show: the few newest are asked first, then
+    more; None where none shows one.
+    """
     for count in (MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES):
         newest = length.newest(count)
-        if (
-            newest
-            and (cause := cause_of(newest, length.length_s or LONGEST_S, history_s, others))
-            is not None
-        ):
+        if not newest:
+            continue
+        cause = cause_of(newest, length.length_s or LONGEST_S, history_s, others)
+        if cause is not None:
             return cause
     return None
 
@@ -154,6 +158,7 @@ class _History:
         self._stretches.append(stretch)
         while stretch.to_ns - self._stretches[0].to_ns > HISTORY_S * NS_PER_S:
             self._stretches.popleft()
+        # not yet due; a time far ahead is that of a sender that has started anew since
         if self._next_ns is not None and 0 <= self._next_ns - stretch.to_ns <= LAG_EACH_NS:
             return None
         self._next_ns = stretch.to_ns + LAG_EACH_NS
@@ -223,8 +228,10 @@ class RateCheck:
         anew.
         """
         last_ns = self._last_ns
+        # a little earlier: overtaken, or sent twice
         if last_ns is not None and last_ns - RESTART_NS < sample.t_ns <= last_ns:
             return False
+        # much earlier is a sender that starts anew; across a gap nothing says how it turned
         if last_ns is not None and not 0 < sample.t_ns - last_ns <= MAX_GAP_NS:
             self._restart()
         self._last_ns = sample.t_ns

@@ -433,12 +433,13 @@ class SenderClock:
         uncertainty_ns = line.uncertainty_ns
         if self.mode == "one-way":
             uncertainty_ns = max(uncertainty_ns, self._one_way.all_above_ns) + LOCAL_DELAY_NS
+        uncertainty_ms = None
+        if math.isfinite(uncertainty_ns):
+            uncertainty_ms = (uncertainty_ns + behind_ns) / NS_PER_MS
         return ClockSummary(
             self.mode,
             offset_ms=(self._base_ns + line.offset_ns) / NS_PER_MS,
             drift_ppm=0.0 - line.drift * 1e6,
-            uncertainty_ms=(
-                (uncertainty_ns + behind_ns) / NS_PER_MS if math.isfinite(uncertainty_ns) else None
-            ),
+            uncertainty_ms=uncertainty_ms,
             exchanges=self._exchanges.count,
         )

@@ -39,7 +39,7 @@ MIN_RUN = 3  # messages: a counter, and no stray
 ESTABLISHED_AFTER = 8
 # other counters begun, and no fewer than the messages of the one shown: there is no counter
 MAX_BEGUN = 3
-REGULAR_AFTER = 16
+REGULAR_AFTER = 16  # messages, before it is known whether a counter runs evenly
 # share of steps that are as the one before: 0.5 where 3 of 10 packets are lost, 0.05 where 9 are
 REGULAR_SHARE, IRREGULAR_SHARE = 0.5, 0.25
 OTHER_LIFE_NS = 5 * NS_PER_S
@@ -54,7 +54,7 @@ MAX_STEP_NS = 10 * NS_PER_S  # between two messages, for their period
 MIN_KNOWN, MIN_KNOWN_NS = 8, NS_PER_S  # before a sender's usual silences are known
 USUAL_SILENCES, SLACK_NS = 3, 20 * NS_PER_MS
 FORGETS = 0.98  # decay of a silence with each message
-PERIOD_GAIN = EVEN_GAIN = 1 / 8
+PERIOD_GAIN = EVEN_GAIN = 1 / 8  # each message's weight in the running means
 
 # a number, or an address and port; None where a message shows neither
 Identity = int | tuple[Any, ...] | None
@@ -122,7 +122,9 @@ class _Counter:
 
     @property
     def regular(self) -> bool:
-        """Whether it runs so evenly that what does not continue it is not its own."""
+        """Whether its counts come so evenly that a message that does not continue them is another
+        sender's.
+        """
         return self.heard >= REGULAR_AFTER and self.even_share >= REGULAR_SHARE
 
     def off_ns(self, arrival: SampleArrival) -> float | None:
@@ -195,6 +197,7 @@ class _Counter:
         step = _steps(self.sequence, sample.sequence)
         if not -RECENT < step < 0 or sample.t_ns >= self.t_ns:
             return False
+        # older by more than twice what its count says: of another counter
         if sample.t_ns < self.t_ns + 2 * step * (self.period_ns or 0.0) - EARLY_NS:
             return False
         taken = self.taken.get(sample.sequence % RECENT)
@@ -231,7 +234,7 @@ class _Counter:
         self.taken[sample.sequence % RECENT] = _Taken(sample.sequence, sample.t_ns)
 
     def patience_ns(self, silent_after_ns: int) -> float:
-        """For how long it may be silent before another counter is its own, begun anew."""
+        """The silence after which another counter is taken for the same sender, started anew."""
         if self.heard < MIN_KNOWN or self.host_ns - self.since_ns < MIN_KNOWN_NS:
             return silent_after_ns
         return min(silent_after_ns, USUAL_SILENCES * self.silence_ns + SLACK_NS)
@@ -493,7 +496,9 @@ class Senders:
         return [arrival]
 
     def _all_own(self) -> list[SampleArrival]:
-        """What is held is of the sender shown, as it turns out."""
+        """The messages held back: they turned out to be of the sender shown. Their counters are no
+        longer others'.
+        """
         counters = {id(held.counter) for held in self._held}
         self._others = [other for other in self._others if id(other) not in counters]
         return self._released()
@@ -502,11 +507,14 @@ class Senders:
         return [held.arrival for held in self._emptied()]
 
     def _decided(self, main: _Counter) -> list[SampleArrival]:
-        """What is held, with a refusal but for those messages of this counter."""
-        return [
-            held.arrival if held.counter is main else _refused_beside(held)
-            for held in self._emptied()
-        ]
+        """The messages held back, each with a refusal unless it is of this counter."""
+        arrivals: list[SampleArrival] = []
+        for held in self._emptied():
+            if held.counter is main:
+                arrivals.append(held.arrival)
+            else:
+                arrivals.append(_refused_beside(held))
+        return arrivals
 
     def _gives_way(self, main: _Counter, counter: _Counter, silent_ns: int) -> bool:
         """Whether the counter shown has been silent for so long that another takes its place."""

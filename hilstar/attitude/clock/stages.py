@@ -14,7 +14,7 @@ from hilstar.attitude.wire.links import SampleArrival
 
 @dataclass(slots=True)
 class StreamState:
-    """What one stage of a stream sees, and another goes by."""
+    """What stages of one stream tell each other."""
 
     resumed: bool = False  # the sender's clock stood still: it does not jump where it goes on
     busy: bool = False  # messages came just now: the sender shown may be among those to come

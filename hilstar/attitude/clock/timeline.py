@@ -388,8 +388,8 @@ class Timeline:
         return rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
 
     def _damp(self, sample: AttitudeSample) -> _Damped:
-        """What a prediction takes from the rate of the next sample; nothing from one whose
-        acceleration is known.
+        """How far the rate of the next sample is damped before it is used to predict; not at all
+        where its acceleration is known.
         """
         damping = self._damping
         previous = self._samples[-1] if self._samples else None
@@ -399,6 +399,7 @@ class Timeline:
         if rate is None or sample.acceleration_cam_rad_s2 is not None:
             damping.restart()
             return UNDAMPED
+        # Across a gap or a jump the attitudes do not say how the camera turned.
         if (
             previous is None
             or sample.t_ns - previous.t_ns > self.policy.stale_after_ns

@@ -40,7 +40,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import IO, NoReturn
 
@@ -240,20 +240,11 @@ def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
             f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each",
         )
     useable = [segment.useable_ns() for segment in group]
-    edges = sorted(
-        {
-            edge
-            for k, segment in enumerate(group)
-            for edge in (segment.times[0], segment.times[-1], *useable[k])
-        }
-    )
+    spans = [(segment.times[0], segment.times[-1]) for segment in group]
+    edges = sorted(set(chain(*spans, *useable)))
     pieces: list[tuple[int, int, int]] = []  # block number, from, to
     for start, stop in pairwise(edges):
-        having = [
-            k
-            for k, segment in enumerate(group)
-            if segment.times[0] <= start and stop <= segment.times[-1]
-        ]
+        having = [k for k, span in enumerate(spans) if span[0] <= start and stop <= span[1]]
         meant = [k for k in having if useable[k][0] <= start and stop <= useable[k][1]]
         taken = max(meant or having)  # the later one: they come in the order of their first epochs
         if pieces and pieces[-1][0] == taken:
@@ -262,7 +253,9 @@ def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
             pieces.append((taken, start, stop))
     run: list[LogEntry] = []
     for k, start, stop in pieces:
-        piece = _piece(group[k], start, stop if stop == edges[-1] else stop - 1)
+        # the attitude at the end of a piece is that of the next
+        last_ns = stop if stop == edges[-1] else stop - 1
+        piece = _piece(group[k], start, last_ns)
         if run and isinstance(piece[0].event, AttitudeSample):
             piece[0] = LogEntry(piece[0].where, replace(piece[0].event, discontinuity=True))
         run += piece
@@ -379,9 +372,11 @@ def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventi
             q = multiply(
                 q, conjugate(of_date(reference, scale, np.array([first_ns], dtype=np.int64))[0][0])
             )
-        own_q = conjugate(q) if to_body else q
+        aem_q = conjugate(q) if to_body else q
+        if not scalar_first:
+            aem_q = np.roll(aem_q, -1)
         when = "" if inertial else f" at {block.epochs[0]}"
-        return f"{names} = {components(own_q if scalar_first else np.roll(own_q, -1))}{when}"
+        return f"{names} = {components(aem_q)}{when}"
 
     if inertial:
         turned = ""
@@ -431,11 +426,11 @@ def _entries(
         q = multiply(q, q_icrs_to_frame)
         if notice is not None:
             told["earth-orientation"] = notice
-    rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
+    rates: Sequence[tuple[float, ...] | None] = [None] * len(q)
+    if rate is not None:
+        rates = list(map(tuple, rate.tolist()))
     for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
-        yield LogEntry(
-            where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning))
-        )
+        yield LogEntry(where, checked_sample(t_ns, tuple(numbers), turning))
 
 
 def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
@@ -447,15 +442,19 @@ def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
         if kind not in ccsds.QUATERNIONS:
-            q, rate = (
-                _spin(block.values, kind) if kind in ccsds.SPINS else _euler(block.values, meta)
-            )
+            rate: FloatArray | None
+            if kind in ccsds.SPINS:
+                q, rate = _spin(block.values, kind)
+            else:
+                q, rate = _euler(block.values, meta)
             if kind == ccsds.EULER_ANGVEL:
                 q = q if to_cam else conjugate(q)
                 return q, _rate_in_cam(meta, q, np.radians(block.values[:, 3:]))
             if to_cam:
-                return (q, rate)
-            return (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
+                return q, rate
+            if rate is not None:
+                rate = -rotate(conjugate(q), rate)
+            return conjugate(q), rate
         q = block.values[:, :4]
         more = block.values[:, 4:]
         if to_cam:
@@ -530,9 +529,8 @@ def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = N
         "ORIGINATOR": "HILSTAR",
     }
     time_system = _time_system(samples, scale)
-    lines = (_xml if xml else _kvn)(
-        header, [_written_block(block, time_system) for block in blocks]
-    )
+    written = [_written_block(block, time_system) for block in blocks]
+    lines = _xml(header, written) if xml else _kvn(header, written)
     return "\n".join(lines) + "\n"
 
 

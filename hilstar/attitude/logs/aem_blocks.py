@@ -399,15 +399,12 @@ def xml_blocks(text: str) -> list[Block]:
         ) from error
     if reading.messages != 1:
         raise AemFaultError("", f"the <ndm> contains {reading.messages} <aem>; write one")
-    return [
-        Block(
-            segment.meta,
-            [f", {epoch[:40]}" for epoch in segment.epochs],
-            segment.epochs,
-            np.array(segment.rows, dtype=np.float64),
-        )
-        for segment in reading.segments
-    ]
+    blocks: list[Block] = []
+    for segment in reading.segments:
+        where = [f", {epoch[:40]}" for epoch in segment.epochs]
+        rows = np.array(segment.rows, dtype=np.float64)
+        blocks.append(Block(segment.meta, where, segment.epochs, rows))
+    return blocks
 
 
 class _XmlReading:
@@ -536,23 +533,24 @@ def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
         )
     holder.parts(name)
     wanted = paths.split()
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     epochs: list[str] = []
     for path, leaf in _leaves(holder.children[0], ""):
         if path == "EPOCH":
             epochs.append(leaf.text.strip())
             continue
         key = _key(path, leaf, wanted, meta)
-        if key not in wanted or key in found:
-            raise leaf.unlike(
-                f"<{leaf.name[:40]}> {'appears twice' if key in found else 'has no place'} in a"
-                f" <{name}>"
-            )
-        found[key] = _number(leaf, key)
-    missing = [path for path in wanted if path not in found]
-    if missing or len(epochs) != 1:
-        raise holder.unlike(f"a <{name}> has one {missing[0] if missing else 'EPOCH'}")
-    return epochs[0], [found[path] for path in wanted]
+        if key in numbers:
+            raise leaf.unlike(f"<{leaf.name[:40]}> appears twice in a <{name}>")
+        if key not in wanted:
+            raise leaf.unlike(f"<{leaf.name[:40]}> has no place in a <{name}>")
+        numbers[key] = _number(leaf, key)
+    missing = [path for path in wanted if path not in numbers]
+    if missing:
+        raise holder.unlike(f"a <{name}> has one {missing[0]}")
+    if len(epochs) != 1:
+        raise holder.unlike(f"a <{name}> has one EPOCH")
+    return epochs[0], [numbers[path] for path in wanted]
 
 
 def _leaves(element: _Element, path: str) -> Iterator[tuple[str, _Element]]:

@@ -119,6 +119,9 @@ class _CicReading:
         if begins:
             _check_header(self._header)
             self.segments.append(_CicSegment({}))
+        else:
+            # Before the rows: three angles in a row are refused by their type, not by their count.
+            _check_metadata(self.segments[-1])
         self.section = MARKERS[line]
 
 
@@ -139,6 +142,18 @@ def _check_header(header: dict[str, str]) -> None:
     version = header.get(VERSION_KEY, "missing")
     if version not in VERSIONS:
         raise AemFaultError("", f"{VERSION_KEY} is {version[:40]}; write 1.0 or 2.0")
+
+
+def _check_metadata(segment: _CicSegment) -> None:
+    meta = segment.meta
+    end = segment.lines.get("ATTITUDE_TYPE", "")
+    for key in ("REF_FRAME_A", "REF_FRAME_B", "ATTITUDE_DIR", "TIME_SYSTEM", "ATTITUDE_TYPE"):
+        if key not in meta:
+            raise AemFaultError(end, f"{key} is missing in the metadata")
+    if meta["ATTITUDE_TYPE"] != ccsds.QUATERNION:
+        given = meta["ATTITUDE_TYPE"][:40]
+        detail = f"ATTITUDE_TYPE = {given} of a CIC AEM is not read"
+        raise AemFaultError(end, f"{detail}; write {ccsds.QUATERNION}")
 
 
 def _keyword(line: str, known: frozenset[str], where: str) -> tuple[str, str]:
@@ -200,15 +215,8 @@ def _epoch(where: str, day_text: str, seconds_text: str) -> str:
 def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
     """The segment as a block of an AEM 1.0 whose scalar is first. Raises AemFaultError."""
     meta = dict(segment.meta)
-    end = segment.lines.get("ATTITUDE_TYPE", "")
-    for key in ("REF_FRAME_A", "REF_FRAME_B", "ATTITUDE_DIR", "TIME_SYSTEM", "ATTITUDE_TYPE"):
-        if key not in meta:
-            raise AemFaultError(end, f"{key} is missing in the metadata")
-    if meta["ATTITUDE_TYPE"] != ccsds.QUATERNION:
-        given = meta["ATTITUDE_TYPE"][:40]
-        detail = f"ATTITUDE_TYPE = {given} of a CIC AEM is not read"
-        raise AemFaultError(end, f"{detail}; write {ccsds.QUATERNION}")
     if not segment.rows:
+        end = segment.lines["ATTITUDE_TYPE"]
         raise AemFaultError(end, "the segment contains no attitude")
     order = _order(segment)
     for key in ("REF_FRAME_A", "REF_FRAME_B"):

@@ -185,13 +185,16 @@ def _table() -> _EarthTable:
     # UT1, pole
     a_columns = ((58, 68), (18, 27), (37, 46))
     b_columns = ((154, 165), (134, 144), (144, 154))
+    rows = []
     with Path(IERS_A_FILE).open(encoding="ascii") as file:
-        lines = [
-            (line, b_columns if line[154:165].strip() else a_columns)
-            for line in file
-            if line[58:68].strip()
-        ]
-    rows = [(line[7:15], *(line[begin:end] for begin, end in columns)) for line, columns in lines]
+        for line in file:
+            # days beyond the predictions have a date alone
+            if not line[58:68].strip():
+                continue
+            # the final values of Bulletin B, where there are some
+            columns = b_columns if line[154:165].strip() else a_columns
+            cells = [line[begin:end] for begin, end in columns]
+            rows.append((line[7:15], *cells))
     mjd, ut1_utc_s, x_arcsec, y_arcsec = np.array(rows, dtype=np.float64).T
     ut1_tai_s = ut1_utc_s - _tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
     return _EarthTable(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))

@@ -162,19 +162,19 @@ def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None)
     try:
         seconds = float(text)
         if not abs(seconds) <= 1e12:
-            raise InputError(f"--at {text}: {TIME_FORM}")
+            raise InputError(f"--time {text}: {TIME_FORM}")
         t_ns = first_ns + round(seconds * NS_PER_S)
     except ValueError:
         try:
             t_ns = epoch_ns("", text)
         except AemFaultError as fault:
-            raise InputError(f"--at {text}: {fault}") from fault
+            raise InputError(f"--time {text}: {fault}") from fault
     if not first_ns <= t_ns <= last_ns:
         span = f"{(last_ns - first_ns) / NS_PER_S:.9g} s long"
         if first_ns < YEAR_NS:
             raise InputError(
-                f"--at {text}: {path} is {span}, and its times are no dates; {SECONDS_FORM}"
+                f"--time {text}: {path} is {span}, and its times are no dates; {SECONDS_FORM}"
             )
         span += f", from {epoch_text(first_ns)} to {epoch_text(last_ns)} on its own scale"
-        raise InputError(f"--at {text}: {path} is {span}; {TIME_FORM}")
+        raise InputError(f"--time {text}: {path} is {span}; {TIME_FORM}")
     return t_ns

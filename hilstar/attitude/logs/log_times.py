@@ -121,16 +121,28 @@ def _too_far(samples: Sequence[AttitudeSample]) -> float:
     """How many times as far as the quaternions the rates turn, the median; NaN where they have no
     rates or another axis.
     """
-    pairs = [(before, after) for before, after in pairwise(samples) if not after.discontinuity]
-    pairs = [pair for pair in pairs if all(sample.rate_cam_rad_s is not None for sample in pair)]
-    if len(pairs) < MIN_INTERVALS:
+    before: list[AttitudeSample] = []
+    after: list[AttitudeSample] = []
+    for sample, following in pairwise(samples):
+        has_rates = sample.rate_cam_rad_s is not None and following.rate_cam_rad_s is not None
+        if has_rates and not following.discontinuity:
+            before.append(sample)
+            after.append(following)
+    if len(before) < MIN_INTERVALS:
         return float("nan")
-    q = np.array([[sample.q_icrs_to_cam for sample in pair] for pair in pairs])
-    rates = np.array([[sample.rate_cam_rad_s for sample in pair] for pair in pairs])
-    seconds = np.array([(after.t_ns - before.t_ns) / NS_PER_S for before, after in pairs])
-    turned = -to_rotation_vector(multiply(q[:, 1], conjugate(q[:, 0])))
-    by_rate = rates.mean(axis=1) * seconds[:, None]
+    q_before, rate_before = _attitudes_and_rates(before)
+    q_after, rate_after = _attitudes_and_rates(after)
+    seconds = np.array([(b.t_ns - a.t_ns) / NS_PER_S for a, b in zip(before, after, strict=True)])
+    turned = -to_rotation_vector(multiply(q_after, conjugate(q_before)))
+    by_rate = (rate_before + rate_after) / 2 * seconds[:, None]
     return _ratio(turned, by_rate)
+
+
+def _attitudes_and_rates(samples: Sequence[AttitudeSample]) -> tuple[FloatArray, FloatArray]:
+    """The quaternions (n, 4) and rates (n, 3) of samples, all of which have a rate."""
+    q = np.array([sample.q_icrs_to_cam for sample in samples])
+    rate = np.array([sample.rate_cam_rad_s for sample in samples])
+    return q, rate
 
 
 def _ratio(turned: FloatArray, by_rate: FloatArray) -> float:

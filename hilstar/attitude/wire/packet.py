@@ -186,13 +186,15 @@ def encode(packet: Packet) -> bytes:
     """The bytes of a packet; counters wrap at 2^32, and a status's times are clamped to 64 bits."""
     match packet:
         case AttitudeSample(rate_cam_rad_s=rate):
-            flags = 0 if rate is None else protocol.FLAG_RATE_VALID
-            flags |= protocol.FLAG_DISCONTINUITY if packet.discontinuity else 0
-            flags |= packet.sender << protocol.SENDER_FIRST_BIT
+            flags = packet.sender << protocol.SENDER_FIRST_BIT
+            if packet.discontinuity:
+                flags |= protocol.FLAG_DISCONTINUITY
+            rate_numbers = [0.0, 0.0, 0.0]
+            if rate is not None:
+                flags |= protocol.FLAG_RATE_VALID
+                rate_numbers = list(rate)
             head = (VERSION, protocol.KIND_ATTITUDE, flags, packet.sequence % U32, packet.t_ns)
-            body = protocol.ATTITUDE_BODY.pack(
-                *head, *packet.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate)
-            )
+            body = protocol.ATTITUDE_BODY.pack(*head, *packet.q_icrs_to_cam, *rate_numbers)
         case TimeRequest(sequence, t1_ns):
             body = protocol.TIME_REQUEST_BODY.pack(
                 VERSION, protocol.KIND_TIME_REQUEST, 0, sequence % U32, t1_ns
@@ -291,8 +293,10 @@ def _decode_body(kind: int, message: bytes) -> Event:
     number = flags >> protocol.SENDER_FIRST_BIT
     sender = 0 if number == UNSTATED_SENDER else number
     event = checked_sample(t_ns, (w, x, y, z), known_rate, sequence, discontinuity, sender)
-    if isinstance(event, Refusal) and (likely := numbers_likeness(message)) is not None:
-        return named_refusal(event.reason, event.detail, likely, MESSAGE_FORM)
+    if isinstance(event, Refusal):
+        likely = numbers_likeness(message)
+        if likely is not None:
+            return named_refusal(event.reason, event.detail, likely, MESSAGE_FORM)
     return event
 
 
@@ -334,14 +338,8 @@ def checked_sample(
     unit = np.array(q, dtype=np.float64)
     if abs(norm - 1.0) > UNIT:
         unit /= norm
-    return AttitudeSample(
-        t_ns,
-        unit,
-        None if rate is None else np.array(rate, dtype=np.float64),
-        sequence,
-        discontinuity,
-        sender=sender,
-    )
+    rate_cam_rad_s = None if rate is None else np.array(rate, dtype=np.float64)
+    return AttitudeSample(t_ns, unit, rate_cam_rad_s, sequence, discontinuity, sender=sender)
 
 
 def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | None:
@@ -461,12 +459,10 @@ def decode_frame(body: bytes) -> Event:
             telling=True,
         )
     event = _decode_packet(message, FRAME_FORM)
-    if (
-        isinstance(event, Refusal)
-        and event.reason == "format"
-        and (likely := frame_likeness(body)).known
-    ):
-        return named_refusal("format", f"{len(message)} bytes", likely, FRAME_FORM)
+    if isinstance(event, Refusal) and event.reason == "format":
+        likely = frame_likeness(body)
+        if likely.known:
+            return named_refusal("format", f"{len(message)} bytes", likely, FRAME_FORM)
     return event
 
 

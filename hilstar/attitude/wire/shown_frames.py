@@ -27,7 +27,7 @@ import zmq
 
 from hilstar.attitude.wire.keys import NO_KEYS
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
+from hilstar.attitude.wire.zmq_links import ZmqRoad, ZmqSender
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import one_line
 
@@ -105,10 +105,11 @@ def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
     lit = np.frombuffer(indices, dtype="<u4")
     if len(lit) and not (lit[-1] < head.width * head.height and (lit[1:] > lit[:-1]).all()):
         raise ValueError("its indices do not rise within the image")
-    codes = np.frombuffer(values, dtype="<u1" if head.bits <= 8 else "<u2")
-    return ShownFrame(
-        head, lit, codes.reshape(len(lit), 3) if head.channels == 3 else codes.reshape(len(lit))
-    )
+    code_dtype = "<u1" if head.bits <= 8 else "<u2"
+    codes = np.frombuffer(values, dtype=code_dtype)
+    if head.channels == 3:
+        return ShownFrame(head, lit, codes.reshape(len(lit), 3))
+    return ShownFrame(head, lit, codes.reshape(len(lit)))
 
 
 class FrameSender(ZmqSender):
@@ -170,7 +171,7 @@ class FrameSender(ZmqSender):
             self._ready().send_multipart(frame_parts(frame), zmq.NOBLOCK, copy=False)
 
 
-class FrameWatch(ZmqReceiver):
+class FrameWatch(ZmqRoad):
     """The watcher's end: connects to where the frames are sent from. `refused` counts messages
     that are no frames.
     """
@@ -178,11 +179,12 @@ class FrameWatch(ZmqReceiver):
     def __init__(self, endpoint: str) -> None:
         self.refused = 0
         self.why_refused = ""
-        super().__init__(endpoint, keys=NO_KEYS, max_part_bytes=MAX_FRAME_BYTES)
-
-    def _configure(self, made: zmq.Socket[bytes]) -> None:
-        super()._configure(made)
-        made.setsockopt(zmq.RCVHWM, WAITING_FRAMES)
+        super().__init__(
+            endpoint,
+            queue_messages=WAITING_FRAMES,
+            keys=NO_KEYS,
+            max_part_bytes=MAX_FRAME_BYTES,
+        )
 
     def frames(self, timeout_ms: int) -> list[ShownFrame]:
         """The frames that came, oldest first; waits at most `timeout_ms` for the first."""

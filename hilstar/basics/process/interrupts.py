@@ -34,7 +34,7 @@ GUARD_WAITS_S = 0.9
 # a terminal and a wrapper both pass one Ctrl-C on: what comes so soon after a signal is no second
 # one
 ECHO_S = 0.1
-POLL_S = 0.02
+POLL_S = 0.02  # between two looks for a second signal
 PR_SET_PDEATHSIG = 1  # prctl(2)
 SIGNALLED = 128  # and the signal's number: the exit code of a process that a signal ended
 MAX_WAITING_BYTES = 1 << 20
@@ -77,7 +77,9 @@ def install() -> None:
             # somewhere, too.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
-            setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
+            mode = "w" if descriptor else "r"
+            stream = open(descriptor, mode, closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
     watched, teller = socket.socketpair()
     teller.setblocking(False)
     parent = os.getpid()
@@ -251,6 +253,9 @@ def _whereabouts() -> str:
 
 
 def _say_if_read(line: str) -> None:
+    """Write a line to stderr where there is room in its pipe: one that nobody reads holds nothing
+    up.
+    """
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
             os.write(2, line.encode())
@@ -355,11 +360,9 @@ class _QueuedStderr(io.RawIOBase):
                 piece = self._waiting.popleft()
                 dropped = self._dropped
                 self._dropped = 0
-            data = piece + (
-                f"hilstar: {dropped} lines were dropped: nothing read them\n".encode()
-                if dropped
-                else b""
-            )
+            data = piece
+            if dropped:
+                data += f"hilstar: {dropped} lines were dropped: nothing read them\n".encode()
             with contextlib.suppress(OSError):  # there is no reader to tell
                 while data:
                     try:

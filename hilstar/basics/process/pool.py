@@ -21,7 +21,7 @@ from hilstar.basics.process.interrupts import end_with_parent
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerProcess
 
-END_S = 2.0
+END_S = 2.0  # for a worker to end by itself, and again once it is killed
 ONE_THREAD = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Work = Callable[..., Any]

@@ -22,7 +22,7 @@ from hilstar.basics.process.closing import Closing
 
 MAX_OUTPUT_BYTES = 4_000_000  # each of stdout and stderr: a chatty solver prints some 100 kB
 CHUNK_BYTES = 65_536
-ENDED_WAIT_S = 1.0
+ENDED_WAIT_S = 1.0  # a grandchild may hold a killed command's pipe open for ever
 EACH_S = 1.0  # the status, and the watchdog where it asks for less
 READY_POLL_S = 0.05
 US_PER_S = 1_000_000

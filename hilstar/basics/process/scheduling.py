@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-FIFO_PRIORITY = 10
+FIFO_PRIORITY = 10  # of 1 to 99, all of which are above every ordinary process
 # How long another thread may keep Python's lock from the frame loop; 5 ms by default, a third of a
 # frame.
 SWITCH_INTERVAL_S = 0.0005
@@ -106,11 +106,10 @@ class HostClock:
         (adjtimex, `maxerror`).
         """
         kernel_clock = Timex()  # modes = 0: nothing is set
-        answered = ctypes.CDLL(None).adjtimex(ctypes.byref(kernel_clock)) >= 0
-        return UnixOffset(
-            self.monotonic_minus_realtime_ns(),
-            kernel_clock.maxerror * 1000 if answered else UNDISCIPLINED_NS,
-        )
+        uncertainty_ns = UNDISCIPLINED_NS
+        if ctypes.CDLL(None).adjtimex(ctypes.byref(kernel_clock)) >= 0:
+            uncertainty_ns = kernel_clock.maxerror * 1000  # from microseconds
+        return UnixOffset(self.monotonic_minus_realtime_ns(), uncertainty_ns)
 
     def sleep(self, seconds: float) -> None:
         """Do nothing for a while; nothing for 0 or less."""

@@ -59,11 +59,11 @@ def _check_place(package: str, folder: str) -> None:
             f"no module {package} stands in {folder}; {ADVICE.format(package=package)}"
         )
     loaded = sys.modules.get(package)
+    # Python would give the package of that name again that it has loaded from another folder.
     if loaded is not None and package in _folders and _folders[package] != folder:
-        for module_name in [
-            module_name for module_name in sys.modules if module_name.partition(".")[0] == package
-        ]:
-            del sys.modules[module_name]
+        for module_name in list(sys.modules):
+            if module_name.partition(".")[0] == package:
+                del sys.modules[module_name]
         loaded = None
     is_foreign = package in sys.stdlib_module_names or (
         loaded is not None and not _is_same(loaded.__spec__, spec)
@@ -82,8 +82,8 @@ def _is_same(one: ModuleSpec | None, other: ModuleSpec) -> bool:
 
 
 def _look_here_last(folder: str) -> None:
-    """What the module imports later is found beside it, but nothing there stands in the way of
-    what is installed.
+    """Put a folder last in the search path: the module there finds its neighbours, and nothing
+    there hides an installed package.
     """
     while folder in sys.path:
         sys.path.remove(folder)

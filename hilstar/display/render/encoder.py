@@ -92,8 +92,8 @@ def _source(
 ) -> str:
     """A file of shaders/ after `defines`, between others."""
     version, body = _shader(main).split("\n", 1)
-    first, last = ([_shader(name) for name in names] for names in (before, after))
-    return "\n".join([version, *(f"#define {name}" for name in defines), *first, body, *last])
+    head = [version, *(f"#define {name}" for name in defines)]
+    return "\n".join([*head, *map(_shader, before), body, *map(_shader, after)])
 
 
 def set_uniforms(
@@ -166,11 +166,16 @@ def sprites_array(
     program: moderngl.Program, buffer: moderngl.Buffer, planes: Planes
 ) -> moderngl.VertexArray:
     """A vertex array of what a program of star.vert asks of sprites in a buffer."""
-    inputs = {name: INPUTS[name] for name in planes.dtype.names or ()}
-    layout = (form if name in program else f"{4 * int(form[0])}x" for name, form in inputs.items())
-    return program.ctx.vertex_array(
-        program, [(buffer, " ".join(layout), *(name for name in inputs if name in program))]
-    )
+    layout = []
+    names = []
+    for name in planes.dtype.names or ():
+        form = INPUTS[name]
+        if name in program:
+            layout.append(form)
+            names.append(name)
+        else:
+            layout.append(f"{4 * int(form[0])}x")  # bytes that this program does not read
+    return program.ctx.vertex_array(program, [(buffer, " ".join(layout), *names)])
 
 
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
@@ -195,7 +200,9 @@ def lit_sides(
     There the level is 0 wherever the wings of no more stars than that meet.
     """
     gain = panel.gain()
-    light = lit_e_per_s / (1.0 if gain is None else float(gain.max()))
+    light = lit_e_per_s
+    if gain is not None:
+        light = lit_e_per_s / float(gain.max())
     sizes = range(psf.footprint_px - 2, 0, -2)
     every = -(-len(sizes) // MAX_SIDES) or 1
     rates = {size: light / wings / psf.outside_share(size) for size in sizes[::every]}
@@ -232,14 +239,12 @@ class Eraser:
         self._ctx = ctx
         self._planes = planes
         self._size_px = size_px
-        if of_levels:
-            on_processor = MAX_ERASED_LEVELS
-        else:
-            on_processor = MAX_ERASED_LIGHT
-        self._most_px = (
-            size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
-        )
-        self._most_share = MAX_ERASED_REGION if is_software(ctx) else MAX_ERASED_BY_CARD
+        max_share = MAX_ERASED_BY_CARD
+        self._most_share = MAX_ERASED_BY_CARD
+        if is_software(ctx):
+            max_share = MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT
+            self._most_share = MAX_ERASED_REGION
+        self._most_px = size_px[0] * size_px[1] * max_share
         defines = ("LEVELS 0u",) if of_levels else ()
         self._program = build_program(ctx, "star.vert", "erase.frag", defines)
         self._program["resolution_px"] = size_px
@@ -303,11 +308,11 @@ def draw_tiles(
     if not len(corners):
         return
     set_uniforms(program, {"size_px": size_px, "air": of_air})
-    buffer, has_given = program.ctx.buffer(corners), "given" in program
-    names = ("place_px", "given") if has_given else ("place_px",)
-    triangles = program.ctx.vertex_array(
-        program, [(buffer, "2f 4f" if has_given else "2f 16x", *names)]
-    )
+    buffer = program.ctx.buffer(corners)
+    content: tuple[moderngl.Buffer, *tuple[str, ...]] = (buffer, "2f 16x", "place_px")
+    if "given" in program:
+        content = (buffer, "2f 4f", "place_px", "given")
+    triangles = program.ctx.vertex_array(program, [content])
     triangles.render(moderngl.TRIANGLES)
     triangles.release()
     buffer.release()
@@ -330,13 +335,16 @@ class LevelTexture:
         shape = height, width, planes.texel
         made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
         self.image, self.memory = pinned(ctx, shape, kind) if shares_memory(ctx) else made
-        self._levels = Levels(
-            self.image[..., : len(planes.panels)] if planes.apart else self.image[..., 0]
-        )
         self._dtype = f"u{self.image.itemsize}"
         bits = 8 * self.image.itemsize
+        if planes.apart:
+            self._levels = Levels(self.image[..., : len(planes.panels)])
+            levels_format = f"rgba{bits}ui"
+        else:
+            self._levels = Levels(self.image[..., 0])
+            levels_format = f"r{bits}ui"
         self.defines = (
-            f"LEVELS_FORMAT {'rgba' if planes.apart else 'r'}{bits}ui",
+            f"LEVELS_FORMAT {levels_format}",
             f"LEVEL_BITS {bits}",
             f"TEXEL {planes.texel}",
         )
@@ -370,7 +378,10 @@ class LevelTexture:
 
 def write(buffer: moderngl.Buffer, values: npt.NDArray[Any]) -> None:
     """Give a buffer these values and no others; it grows by doubling."""
-    buffer.orphan(2 * values.nbytes if buffer.size < values.nbytes else buffer.size)
+    size = buffer.size
+    if size < values.nbytes:
+        size = 2 * values.nbytes
+    buffer.orphan(size)
     buffer.write(values)
 
 
@@ -408,9 +419,12 @@ def level_steps(
     bin has several thresholds.
     """
     tables = [code_table(table_edges) for table_edges in edges]
-    steps = [table_steps for table in tables if (table_steps := table.steps()) is not None]
-    if len(steps) < len(tables):
-        return None
+    steps = []
+    for table in tables:
+        table_steps = table.steps()
+        if table_steps is None:
+            return None
+        steps.append(table_steps)
     joined_steps, begins = joined(steps)
     bins = []
     for table_edges, begin in zip(tables, begins, strict=True):
@@ -453,11 +467,11 @@ class Encoder:
         defines = [*planes.defines, *["RISES"] * bool(rises), *["UNIFORMITY"] * (gain is not None)]
         edges = [quantiser.edges_e_per_s(panel) for panel in planes.panels]
         table = level_steps(edges)
-        if table is None:
-            steps = None
-        else:
+        steps = None
+        if table is not None:
             steps = table_rows(table[0], ctx)
-        defines += [] if table is None else [f"STEPS {0 if steps is None else len(steps)}"]
+            row_count = 0 if steps is None else len(steps)
+            defines.append(f"STEPS {row_count}")
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
         of_image = [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
         last = ["levels.glsl"] * (table is not None) + [rises] * bool(rises)
@@ -513,7 +527,8 @@ class Encoder:
         """The program that encodes the linear image with a vertex shader, or tiles' own light;
         made when first asked for.
         """
-        if (key := (vertex, *of_tiles)) not in self._programs:
+        key = (vertex, *of_tiles)
+        if key not in self._programs:
             include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
             program = self._built(
                 vertex=vertex,
@@ -608,14 +623,13 @@ class Encoder:
             (tiles.face_levels, ("TILE",)),
             (tiles.air_levels, ("TILE", "AIR")),
         )
-        for program, corners in [
-            (self._program("tile.vert", *defines), corners)
-            for corners, defines in given
-            if len(corners)
-        ]:
-            set_uniforms(program, uniforms)
-            draw_tiles(program, corners, self._size_px, tiles.of_air)
-        if (key := ("white",)) not in self._programs:
+        for corners, defines in given:
+            if len(corners):
+                program = self._program("tile.vert", *defines)
+                set_uniforms(program, uniforms)
+                draw_tiles(program, corners, self._size_px, tiles.of_air)
+        key = ("white",)
+        if key not in self._programs:
             self._programs[key] = build_program(
                 self._ctx, "tile.vert", "erase.frag", (f"LEVELS {self._white}u",)
             )

@@ -11,7 +11,7 @@ import moderngl
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, IntArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.display.balance import SUMS, Balance
 from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left, Turn
 from hilstar.display.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
@@ -50,7 +50,7 @@ SUMS_BYTES = 4 * SUMS
 
 
 class PixelSums:
-    """What the shaders see of stars that `cpu_stars` draws: sprites, pixels' sums and levels.
+    """Sprites, sums of light and levels that `cpu_stars` has drawn, as compute shaders read them.
 
     `values` int32 (n,) are the sums, in memory that this GL shares. It lives in its renderer's
     context, which is current in every call.
@@ -85,10 +85,11 @@ class PixelSums:
 
 
 class ExactPass:
-    """Chooses the levels of sprites anew on a plane of a LevelTexture that has the nearest ones.
+    """Chooses the levels of stars by a compute shader, on a plane of a LevelTexture that has the
+    nearest levels.
 
-    `turn` says on which, and for what stars make up there; `left` has room for what all planes
-    leave. It lives in its renderer's context.
+    `turn` says on which plane, and for which errors of the planes before stars make up on it;
+    `left` is a buffer for the errors that all planes leave. It lives in its renderer's context.
     """
 
     def __init__(
@@ -226,11 +227,10 @@ class ExactPass:
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
         """The tables by which levels are chosen."""
-        return [
-            self._order.buffer,
-            self._light.buffer,
-            *([] if self._gain is None else [self._gain]),
-        ]
+        tables: list[moderngl.Texture | moderngl.Buffer] = [self._order.buffer, self._light.buffer]
+        if self._gain is not None:
+            tables.append(self._gain)
+        return tables
 
     def draw(
         self, buffer: moderngl.Buffer, sprites: FrameLight, sums: PixelSums | None = None
@@ -257,7 +257,8 @@ class ExactPass:
         elif self._memory is not None:
             self._memory.bind(sprites.star, np.zeros(count, dtype=np.bool_))
         elif self._together is not None:
-            if self._together.size < (size := count * len(self._planes.panels) * SUMS_BYTES):
+            size = count * len(self._planes.panels) * SUMS_BYTES
+            if self._together.size < size:
                 self._together.orphan(2 * size)
             self._together.bind_to_storage_buffer(FIRST_BINDING + 2)
         buffer.bind_to_storage_buffer(0)
@@ -335,8 +336,8 @@ class Memory:
 
 
 def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
-    """A footprint's pixels by distance for each phase; in a word x, y and their parts in the
-    boxes.
+    """The pixels of a footprint, nearest first, for each phase, packed for the shader: x and y in 6
+    bits each, then the pixel's shares of the 3 x 3 and the 5 x 5 box in 10 bits each.
     """
     x, y = order.places()
     away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
@@ -358,13 +359,16 @@ def overrated(width_px: tuple[float, float]) -> float:
     if min(width_px) < NARROW_PX:
         return OVERRATED
     away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
-    along_x, along_y = (
-        np.maximum.accumulate([_ratio(float(place), width) for place in away]) for width in width_px
-    )
+    along_x, along_y = (_largest_ratios(away, width) for width in width_px)
     rest = np.sqrt(REACH_SIGMA**2 - away**2)
-    return OVERRATED * float(
-        (along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max()
-    )
+    along_rest = along_y[np.searchsorted(away, rest, side="right") - 1]
+    return OVERRATED * float((along_x * along_rest).max())
+
+
+def _largest_ratios(places: FloatArray, width_px: float) -> FloatArray:
+    """The largest `_ratio` up to each of rising places (n,)."""
+    ratios = [_ratio(place, width_px) for place in places.tolist()]
+    return np.maximum.accumulate(np.array(ratios))
 
 
 def _ratio(place: float, width_px: float) -> float:
@@ -378,8 +382,8 @@ def _ratio(place: float, width_px: float) -> float:
 
 
 def stretches_of(star: IntArray) -> IntArray:
-    """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and
-    of its path.
+    """Stretches of paths along which sprites pass on their errors, (n, 4): the first sprite and the
+    end of each, and those of its path.
     """
     begins = np.flatnonzero(np.diff(star, prepend=star[0] - 1))
     ends = np.append(begins[1:], len(star))

@@ -107,13 +107,11 @@ class LightUnits:
 
         Of one that stands `alone` no pixel beyond it is lit.
         """
-        if len(sprites) * self._footprint_px**2 > math.prod(self.size_px):
-            denser = DENSER_WINGS
+        # how many stars' wings may meet in a pixel
+        if alone:
+            wings = 1.0
+        elif len(sprites) * self._footprint_px**2 > math.prod(self.size_px):
+            wings = self.wings * DENSER_WINGS
         else:
-            denser = 1
-        return (
-            self._share_bound
-            * sprites.per_star
-            * (1.0 if alone else self.wings * denser)
-            / self.lit_e_per_s
-        )
+            wings = self.wings
+        return self._share_bound * sprites.per_star * wings / self.lit_e_per_s

@@ -144,7 +144,9 @@ class NumpyBackend(Backend):
             stars.add(packed, self._units.unit_for(packed))
             stars.encode()
         image = self._level_image
-        self._levels = Levels(image if self.target.primaries else image[..., 0])
+        if not self.target.primaries:
+            image = image[..., 0]
+        self._levels = Levels(image)
         return True
 
     def _plane(self, frame: int, k: int, light: FrameLight | None) -> Levels:

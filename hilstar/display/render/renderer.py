@@ -51,9 +51,9 @@ from hilstar.optics.sprites import FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Sure, Tiles
-    from hilstar.display.render.extended import ExtendedLayer
+    from hilstar.display.render.extended_drawing import ExtendedLayer
 
-FIRST_CAPACITY = 4096
+FIRST_CAPACITY = 4096  # sprites; the buffer grows by doubling
 UNTIMED = nullcontext()
 
 
@@ -225,14 +225,18 @@ class Renderer(Backend):
         for program in (self._unit_splat, encoder.sprite_program):
             program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
 
+    def _array_of(self, program: moderngl.Program | None) -> moderngl.VertexArray | None:
+        """The sprites in the buffer as a program takes them."""
+        if program is None:
+            return None
+        return sprites_array(program, self._buffer, self._planes)
+
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
         self._capacity = sprites
         self._buffer = self._ctx.buffer(reserve=sprites * self._planes.dtype.itemsize, dynamic=True)
-        self._splat_vao, self._unit_vao = (
-            None if program is None else sprites_array(program, self._buffer, self._planes)
-            for program in (self._splat, self._unit_splat)
-        )
+        self._splat_vao = self._array_of(self._splat)
+        self._unit_vao = self._array_of(self._unit_splat)
         self._last_count: int | None = None  # sprites in the buffer and on the images
         for eraser in (self._eraser, self._level_eraser):
             eraser.take_places_from(self._buffer, self.footprint_px)
@@ -306,7 +310,9 @@ class Renderer(Backend):
         self._choose(sprites, sums)
 
     def _forget_cpu(self, stars: CpuStars) -> None:
-        """Something else draws the levels, or has changed them."""
+        """Forget what the CPU drew last: the levels are drawn by something else now, or were
+        changed.
+        """
         stars.forget()
         if self._levels is not None:
             self._levels.in_memory = False
@@ -321,13 +327,13 @@ class Renderer(Backend):
 
     @cached_property
     def _white(self) -> "Renderer":
-        """What draws linear images beside those of primaries."""
+        """A renderer of linear images, for a target of primaries, which has none of its own."""
         return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
 
     @cached_property
     def _extended(self) -> "ExtendedLayer":
         # no frame of stars alone needs it
-        from hilstar.display.render.extended import ExtendedLayer
+        from hilstar.display.render.extended_drawing import ExtendedLayer
 
         return ExtendedLayer(self._ctx, self.target.resolution_px)
 
@@ -393,8 +399,10 @@ class Renderer(Backend):
         frame left.
         """
         for exact_pass in self._exact_passes:
-            if self._exact and (remainder := self._exact[exact_pass.plane].left) is not None:
-                exact_pass.left, self._exact[exact_pass.plane].left = remainder, None
+            # what NumPy's quantiser carries goes on here
+            if self._exact and self._exact[exact_pass.plane].left is not None:
+                exact_pass.left = self._exact[exact_pass.plane].left
+                self._exact[exact_pass.plane].left = None
             if sprites is None or not len(sprites):
                 exact_pass.left = None
                 continue
@@ -407,14 +415,15 @@ class Renderer(Backend):
         if levels is None or by_star is None:
             return
         if not self._exact:
-            self._exact = {
-                k: one
-                for k, one in quantisers_of(target).items()
-                if isinstance(one, ExactQuantiser)
-            }
-        for one in self._exact_passes:
-            if (left := one.left) is not None:
-                self._exact[one.plane].left, one.left = left, None
+            for plane, quantiser in quantisers_of(target).items():
+                if isinstance(quantiser, ExactQuantiser):
+                    self._exact[plane] = quantiser
+        # what the shader carries goes on here
+        for exact_pass in self._exact_passes:
+            carried = exact_pass.left
+            if carried is not None:
+                self._exact[exact_pass.plane].left = carried
+                exact_pass.left = None
         floor = None
         if sprites is not None and sprites.extended:
             floor = self._floor(sprites, by_star.floor_turn(frame)).read()
@@ -452,7 +461,9 @@ class Renderer(Backend):
         return self._floor_levels
 
     def _sure(self, quantiser: type[PixelQuantiser], sprites: FrameLight | None) -> "Sure | None":
-        """What a quantiser's levels need not know of a disc's light, where there is one plane."""
+        """The bounds beyond which a disc's levels are sure without its exact light: black below the
+        first and white above the second. None with several planes.
+        """
         if self._planes.apart or not self._planes.panels:
             return None
         from hilstar.display.render.disc_tiles import Sure
@@ -474,7 +485,10 @@ class Renderer(Backend):
         fbo = self._linear_fbo
         self._regions = ()
         for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
-            fbo.color_mask = tuple(plane == k or not self._planes.apart for k in range(4))  # type: ignore[assignment]
+            if self._planes.apart:
+                fbo.color_mask = plane == 0, plane == 1, plane == 2, plane == 3
+            else:
+                fbo.color_mask = True, True, True, True
             regions, self._tiles = self._extended.draw(fbo, lights, sure)
             self._regions += regions
         fbo.color_mask = True, True, True, True

@@ -24,6 +24,8 @@ MAX_LISTED = 18
 NVIDIA = "nvidia-settings: "
 WRONG, DOUBTFUL, RIGHT = "wrong", "doubtful", "right"
 DITHERS = "the driver adds a pattern to every code"
+ONE = (0, 1)  # as a drm_color_ctm has it
+IDENTITY_HALVES = [*ONE, *[0] * 6, *ONE, *[0] * 6, *ONE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +64,11 @@ class OutputState:
         """The output for a person."""
         width, height = self.mode_px
         parts = [f"{self.name}, {width} x {height}"]
-        parts += [
-            f"{name} {_words(value)}" for name, value in sorted((self.properties or {}).items())
-        ]
-        return "; ".join(parts) + ("" if self.properties else "; no properties")
+        for name, value in sorted((self.properties or {}).items()):
+            parts.append(f"{name} {_words(value)}")
+        if not self.properties:
+            parts.append("no properties")
+        return "; ".join(parts)
 
 
 class Finding(NamedTuple):
@@ -118,10 +121,9 @@ def findings(
         and abs(edid_pitch_um[0] - pixel_pitch_um)
         > PITCH_TOLERANCE * edid_pitch_um[0] + edid_pitch_um[1]
     ):
-        told = f"{state.name} says by its EDID that its pixels are {edid_pitch_um[0]:.1f} um apart"
         text = (
-            f"{told} and the bench file says {pixel_pitch_um:g}; measure it, and set [monitor]"
-            " pixel_pitch_um"
+            f"{state.name} says by its EDID that its pixels are {edid_pitch_um[0]:.1f} um apart and"
+            f" the bench file says {pixel_pitch_um:g}; measure it, and set [monitor] pixel_pitch_um"
         )
         yield Finding(text, False)
 
@@ -239,18 +241,12 @@ def _identity_matrix(value: Value, bits: int) -> str:
     """A matrix of drm_color_ctm: nine numbers of sign, 31 and 32 bits, the low half first; all 0
     where none is set.
     """
-    halves = (
-        np.array([value] if isinstance(value, int) else value).astype(np.int64) & 0xFFFFFFFF
-        if value
-        else np.zeros(1)
-    )
-    if not np.any(halves):
+    if not value:
         return RIGHT
-    return (
-        RIGHT
-        if halves.tolist() == [0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1]
-        else WRONG
-    )
+    halves = (np.atleast_1d(value).astype(np.int64) & 0xFFFFFFFF).tolist()
+    if not any(halves) or halves == IDENTITY_HALVES:
+        return RIGHT
+    return WRONG
 
 
 def _set(value: str) -> str:

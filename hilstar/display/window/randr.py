@@ -200,18 +200,18 @@ class Randr(Closing):
             modes = {mode.id: mode for mode in resources.modes[: resources.nmode]}
             for number in resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
-                    if output is None or not output.crtc:
-                        state = None
-                    else:
+                    state = None
+                    # an output without a CRTC is connected at most, and shows nothing
+                    if output is not None and output.crtc:
                         state = self._state(resources, number, output, modes)
-                lit += [] if state is None else [state]
+                if state is not None:
+                    lit.append(state)
         providers = self._providers()
-        names = [state.name for state in lit]
-        others = [tuple(name for name in names if name != state.name) for state in lit]
-        return [
-            replace(state, others=rest, providers=providers)
-            for state, rest in zip(lit, others, strict=True)
-        ]
+        states: list[OutputState] = []
+        for state in lit:
+            others = tuple(other.name for other in lit if other.name != state.name)
+            states.append(replace(state, others=others, providers=providers))
+        return states
 
     def ramp(self, name: str) -> bytes:
         """The gamma ramp of an output: 16 bits for each step of red, then green, then blue; b""
@@ -249,21 +249,17 @@ class Randr(Closing):
         properties = dict(self._properties(number))
         edid = properties.pop("EDID", b"")
         name = _name(output)
+        preferred = [k for k in output.modes[: output.npreferred] if k in modes]
+        preferred_px = [_size_px(modes[k]) for k in preferred]
+        readable = {k: value for k, value in properties.items() if not isinstance(value, bytes)}
         return OutputState(
             name=name,
             mode_px=_size_px(mode),
             refresh_hz=mode.dot_clock / pixels if pixels else 0.0,
-            preferred_px=tuple(
-                dict.fromkeys(
-                    _size_px(modes[k]) for k in output.modes[: output.npreferred] if k in modes
-                )
-            ),
+            preferred_px=tuple(dict.fromkeys(preferred_px)),
             transform=self._transform(output.crtc),
             rotated=rotated,
-            properties={
-                key: value for key, value in properties.items() if not isinstance(value, bytes)
-            }
-            | self._of_nvidia(name),
+            properties=readable | self._of_nvidia(name),
             edid=edid if isinstance(edid, bytes) else b"",
         )
 
@@ -307,9 +303,8 @@ class Randr(Closing):
         self._x11.XFree(data)
         if raw and form.value == BYTE_BITS:
             return bytes(items)
-        return property_value(
-            self._atom(kind.value) if kind.value else "", form.value, items, self._atom
-        )
+        kind_name = self._atom(kind.value) if kind.value else ""
+        return property_value(kind_name, form.value, items, self._atom)
 
     def _atom(self, atom: int) -> str:
         name = self._x11.XGetAtomName(self._display, atom)
@@ -329,10 +324,10 @@ class Randr(Closing):
         names = []
         with self._resources() as resources:
             for number in () if resources is None else numbers:
-                found = self._xrandr.XRRGetProviderInfo(
+                info = self._xrandr.XRRGetProviderInfo(
                     self._display, ctypes.byref(resources), number
                 )
-                with self._got(_Provider, self._xrandr.XRRFreeProviderInfo, found) as provider:
+                with self._got(_Provider, self._xrandr.XRRFreeProviderInfo, info) as provider:
                     names.append("" if provider is None else _name(provider))
         return tuple(names)
 

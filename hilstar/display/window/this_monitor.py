@@ -40,11 +40,9 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
         adds = randr.additions()
         for state in randr.outputs():
             if state.name == display.name:
-                edid, refresh_hz, adds["a transform"] = (
-                    state.edid,
-                    state.refresh_hz,
-                    state.transform != IDENTITY,
-                )
+                edid = state.edid
+                refresh_hz = state.refresh_hz
+                adds["a transform"] = state.transform != IDENTITY
     edid = edid or edid_of_drm(display.name)
     width, height = display.resolution_px
     return msgspec.structs.replace(
@@ -65,9 +63,10 @@ def edid_of_drm(connector: str, drm: Path = DRM) -> bytes:
     for path in sorted(drm.glob("card*-*/edid")):
         with contextlib.suppress(OSError):
             name = path.parent.name.partition("-")[2]
-            if connector in (name, re.sub(r"-[A-Z](?=-\d)", "", name)) and (
-                edid := path.read_bytes()
-            ):
+            if connector not in (name, re.sub(r"-[A-Z](?=-\d)", "", name)):
+                continue
+            edid = path.read_bytes()
+            if edid:
                 return edid
     return b""
 

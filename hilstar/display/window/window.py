@@ -197,12 +197,9 @@ class Window(Closing):
         if settings.display is not None:
             self.display, monitor = _find(settings.display)
             # Left to itself, GLFW switches a display to its highest refresh.
-            wanted_hz = round(settings.refresh_hz or 0)
-            has_it = wanted_hz in _modes_hz(self.display, monitor)
-            glfw.window_hint(
-                glfw.REFRESH_RATE,
-                wanted_hz if has_it else self.display.refresh_hz or glfw.DONT_CARE,
-            )
+            modes_hz = _modes_hz(self.display, monitor)
+            refresh_hz = _refresh_hint(settings.refresh_hz, modes_hz, self.display)
+            glfw.window_hint(glfw.REFRESH_RATE, refresh_hz)
         for hint, value in (
             (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
             (glfw.RESIZABLE, False),
@@ -227,9 +224,8 @@ class Window(Closing):
             self.display = _describe(self.display.index, monitor)
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
-        glfw.set_input_mode(
-            self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL
-        )
+        cursor = glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL
+        glfw.set_input_mode(self._window, glfw.CURSOR, cursor)
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_monitor_callback(self._on_monitor)
         glfw.set_window_iconify_callback(self._window, self._on_iconify)
@@ -239,12 +235,10 @@ class Window(Closing):
             self._survival = Survival(self._on_end)
             self._survival.cover(self._x_display)
             window = glfw.get_x11_window(self._window)
-            self._visibility = Visibility.of(
-                window, None if monitor is None else _area_of(monitor), self._survival
-            )
-        sync = sync_control(
-            self._x_display, glfw.get_glx_window(self._window) if self._x_display else None
-        )
+            area = None if monitor is None else _area_of(monitor)
+            self._visibility = Visibility.of(window, area, self._survival)
+        glx_window = glfw.get_glx_window(self._window) if self._x_display else None
+        sync = sync_control(self._x_display, glx_window)
         if self.display is not None:
             refresh_hz = self.display.refresh_hz
         else:
@@ -491,6 +485,16 @@ def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
         int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px
     }
     return tuple(sorted(same - {0}))
+
+
+def _refresh_hint(refresh_hz: float | None, modes_hz: tuple[int, ...], display: Display) -> int:
+    """The refresh to ask of GLFW, Hz: the one that is wanted where a mode has it, or else the one
+    that the display has now.
+    """
+    wanted_hz = round(refresh_hz or 0)
+    if wanted_hz in modes_hz:
+        return wanted_hz
+    return display.refresh_hz or int(glfw.DONT_CARE)
 
 
 def _newest_window(width: int, height: int, monitor: Any) -> Any:

@@ -46,7 +46,11 @@ from hilstar.server.answers.answer import JUMP_NS
 from hilstar.server.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.server.bench.alignment import Turned, cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
-from hilstar.server.bench.certificate import Certificate, CubeToBoresight, bench_certificate
+from hilstar.server.bench.certificate_file import (
+    Certificate,
+    CubeToBoresight,
+    bench_certificate,
+)
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.record.commanded import Commanded
 from hilstar.server.record.commanded_run import NOT_SHOWN, CommandedRun, read_commanded
@@ -296,7 +300,7 @@ class Assessment:
         hold_s = self.run.commanded.hold_s
         if not missed:
             return "none"
-        share = 100 * missed / (missed + len(self.run.commanded.t_s))
+        share = 100 * self.run.run.missed_share
         longest = int(np.argmax(hold_s)) if len(hold_s) else -1
         if longest >= 0:
             where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"

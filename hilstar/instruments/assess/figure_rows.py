@@ -1,12 +1,18 @@
 """Rows of a table of figures: an error budget's parts and limits, each with its unit."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
+from hilstar.basics.pages import key_name, table_of, value_text, within
 from hilstar.instruments.assess.budget import Axes, Decomposed
 
 COUNT = "1"  # the unit of counts and shares in the tables
 PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
+
+
+# What the quantities of shares have in their names.
+SHARES = ("availability", "share", "probability")
+AXIS_WORDS = {"cross": "across", "roll": "about the boresight", "z": "about the boresight"}
 
 
 class FigureRow(NamedTuple):
@@ -54,6 +60,27 @@ def limit_rows(limit: Axes | None) -> Iterator[FigureRow]:
     """The rows of the smallest noise that the tracker's stars allow."""
     for axis in ("cross", "roll") if limit is not None else ():
         yield FigureRow("limit of the tracker's stars", axis, getattr(limit, axis), "arcsec")
+
+
+def row_text(row: FigureRow) -> str | None:
+    """A row's value with its interval and unit; shares as percent."""
+    if row.value is None:
+        return None
+    if row.low_95 is not None and row.high_95 is not None:
+        return within(row.value, row.low_95, row.high_95, row.unit)
+    if row.unit != COUNT:
+        return value_text(row.value, unit=row.unit)
+    if any(share in row.quantity for share in SHARES):
+        return f"{100 * row.value:.4g} %"
+    return value_text(row.value)
+
+
+def figures_table(rows: Iterable[FigureRow]) -> str:
+    """The rows as a page has them: quantity, axis, value with its interval."""
+    cells = []
+    for row in rows:
+        cells.append((key_name(row.quantity), AXIS_WORDS.get(row.axis, row.axis), row_text(row)))
+    return table_of(cells, ("quantity", "axis", "value, and its 95 % interval"))
 
 
 def limit_text(limit: Axes | None) -> str:

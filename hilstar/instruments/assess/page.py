@@ -5,12 +5,12 @@ each, and what to do.
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, INK, MUTED, RED, label_ends, panels_of
+from hilstar.basics.charts import BLUE, INK, MUTED, RED, capital, label_ends, panels_of
 from hilstar.basics.files import write_whole
 from hilstar.basics.pages import (
     BAD,
@@ -19,6 +19,7 @@ from hilstar.basics.pages import (
     WARN,
     Card,
     KeyFigure,
+    Markup,
     Verdict,
     details_of,
     drawing_of,
@@ -27,6 +28,7 @@ from hilstar.basics.pages import (
     measured,
     page_of,
     paragraph,
+    side_by_side,
     table_of,
     within,
 )
@@ -34,14 +36,16 @@ from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import Slice
 from hilstar.instruments.assess.budget import Axes
-from hilstar.instruments.assess.figure_rows import COUNT, limit_text
+from hilstar.instruments.assess.figure_rows import PARTS, figures_table, limit_text
 from hilstar.instruments.assess.report import bench_text, display_text, lines_of, rows_of
 
 AVAILABLE = 0.99  # a smaller availability is a warning
 MAX_POINTS = 4000
 MAX_ROWS = 200
 WRONG_HEIGHT = 0.96  # of the marks of wrong answers, in the panel
+BIAS = "bias"
 AXES = ("x", "y", "about the boresight")
+DIRECTIONS = ("across the boresight", "about the boresight")
 ARCSEC = "arcsec"
 WRONG_CURE = "Look at these moments in the run's report, and at these rows of the telemetry."
 LOST_CURE = "Compare the times of the outages with the run's rates, faults and missed frames."
@@ -50,6 +54,20 @@ STILL_CURE = "To measure the clock, assess a run that turns at changing rates."
 YES = {True: "yes", False: ""}
 WRONG_COLUMNS = ("row", "telemetry's time, s", "run time, s", "off by, deg")
 OUTAGE_COLUMNS = ("run time, s", "length, s", "lock lost", "rows", "wrong")
+LARGEST_CURES = {
+    BIAS: Markup(
+        "The bias is the largest: <code>hilstar calibrate alignment</code> takes a mounting's turn"
+        " out."
+    ),
+    PARTS["fov"]: (
+        "What repeats with the place in the field is the largest: calibrate the tracker's lens."
+    ),
+    PARTS["pixel"]: (
+        "What repeats with the place in the pixel is the largest: look at the centroids, or widen"
+        " the point spread function."
+    ),
+    PARTS["noise"]: "Noise is the largest: it falls with more light, stars or exposure.",
+}
 SLICE_COLUMNS = (
     "answers",
     "noise across, arcsec",
@@ -61,16 +79,15 @@ SLICE_COLUMNS = (
 
 def write_page(path: Path, found: Assessment) -> None:
     """Write the page of an assessment as one file that needs no other. Raises InputError."""
-    cards = [
-        _answers(found),
-        *_events(found),
-        *_errors(found),
-        _clock(found),
-        *_beside(found),
-        *_slices(found),
-    ]
+    cards = [_budget(found), _answers(found), *_events(found), *_pictured(found)]
     parts = [figures_of(_counts(found)), *(card.html() for card in cards)]
-    parts.append(_whole_budget(found))
+    parts.append(side_by_side([_bias(found), _pixel(found)]))
+    beside = [_clock(found), _beside(found)]
+    if found.cube is not None:
+        beside.append(Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)]))
+    parts.append(side_by_side(beside))
+    parts += [card.html() for card in _slices(found)]
+    parts.append(_all_figures(found))
     if found.notes:
         parts.append(Card("Notes", words=[list_of(found.notes)]).html())
     title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
@@ -123,7 +140,12 @@ def _counts(found: Assessment) -> Iterator[KeyFigure]:
     yield KeyFigure(_percent(found), f"{cycle}, one each {1e3 * lock.cycle_s:.4g} ms", state)
     yield _count(len(found.wrong), "wrong answers", BAD)
     yield _count(len(lock.lost), "lost locks", BAD)
-    yield _count(found.run.run.missed, "missed frames", WARN)
+    run = found.run.run
+    of = "missed frames"
+    if run.missed:
+        share = f"{100 * run.missed_share:.2g} % of the refresh periods"
+        of = f"{of}, {share}; {run.held} frames were held for them"
+    yield _count(run.missed, of, WARN)
 
 
 def _count(count: int, of: str, state: str) -> KeyFigure:
@@ -175,36 +197,132 @@ def _events(found: Assessment) -> Iterator[Card]:
         yield Card("Wrong answers and outages", words=parts)
 
 
-def _errors(found: Assessment) -> Iterator[Card]:
-    """Bias, field-of-view error, pixel error and noise, one sigma an axis."""
+class BudgetPart(NamedTuple):
+    """A part of the budget with its 95 % interval (2, 2): across the boresight, and about it."""
+
+    name: str
+    axes: Axes
+    interval: FloatArray
+
+
+def _parts(found: Assessment) -> list[BudgetPart]:
+    """Bias, field-of-view error, pixel error and noise."""
     parts = found.found
     intervals = parts.intervals
-    pixel = parts.components.pixel
     low, high = intervals.bias
     cross = parts.bias_arcsec[:2]
-    half = (high[:2] - low[:2]) / 2
+    half = (high - low) / 2
     across = float(np.hypot(*cross))
-    off = float(np.hypot(*(cross * half))) / max(across, 1e-12)  # to first order
-    biases = []
+    off = float(np.hypot(*(cross * half[:2]))) / max(across, 1e-12)  # to first order
+    about = abs(float(parts.bias_arcsec[2]))
+    bias = np.array([[across - off, about - half[2]], [across + off, about + half[2]]])
+    return [
+        BudgetPart(BIAS, Axes(across, about), bias),
+        BudgetPart(PARTS["fov"], parts.fov_arcsec, intervals.fov),
+        BudgetPart(PARTS["pixel"], parts.pixel_arcsec, intervals.pixel),
+        BudgetPart(PARTS["noise"], found.noise_arcsec, intervals.noise),
+    ]
+
+
+def _budget(found: Assessment) -> Card:
+    """What the error is made of, the error about the bias first."""
+    parts = [part for part in _parts(found) if part.axes.cross is not None]
+    rows = []
+    for part in parts:
+        rows.append((part.name, _interval(part, 0), _interval(part, 1)))
+    cross = np.array([part.axes.cross for part in parts], dtype=float)
+    half = np.array([(part.interval[1, 0] - part.interval[0, 0]) / 2 for part in parts])
+    about_bias = [k for k, part in enumerate(parts) if part.name != BIAS]
+    size = float(np.hypot.reduce(cross[about_bias], initial=0.0))
+    off = float(np.hypot.reduce((cross * half)[about_bias], initial=0.0)) / max(size, 1e-12)
+    figure = KeyFigure(
+        measured(size, off, ARCSEC),
+        "error about the bias, one sigma across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
+    )
+    note = (
+        "One sigma an axis; the bias is a constant turn. In brackets: 95 % intervals by the block"
+        " bootstrap."
+    )
+    header = ("part", "across", "about the boresight")
+    return Card(
+        "What the error is made of",
+        figure,
+        [table_of(rows, header), paragraph(note, "small")],
+        _bars(parts),
+        cure=LARGEST_CURES[parts[int(np.argmax(cross))].name],
+    )
+
+
+def _interval(part: BudgetPart, axis: int) -> str | None:
+    """A part across the boresight (0) or about it (1), with its 95 % interval."""
+    value = (part.axes.cross, part.axes.roll)[axis]
+    if value is None:
+        return None
+    low, high = part.interval[:, axis].tolist()
+    return within(value, low, high, ARCSEC)
+
+
+def _bars(parts: Sequence[BudgetPart]) -> str:
+    """The parts beside each other, with their 95 % intervals."""
+    names = [part.name for part in parts]
+    cross = [float(part.axes.cross or 0.0) for part in parts]
+    largest = int(np.argmax(cross))
+    finding = (
+        f"Across the boresight the {names[largest]} is the largest: {cross[largest]:.2g} arcsec"
+    )
+    note = "Bars: one sigma an axis; of the bias its size. Lines: 95 % intervals."
+    with panels_of(finding, 1, 2, share_x=False, note=note, height_inch=3.2) as panels:
+        for k, (axes, name) in enumerate(zip(panels, DIRECTIONS, strict=True)):
+            values = [float((part.axes.cross, part.axes.roll)[k] or 0.0) for part in parts]
+            low = [max(float(part.interval[0, k]), 0.0) for part in parts]
+            high = [float(part.interval[1, k]) for part in parts]
+            heights = range(len(parts))
+            axes.barh(heights, values, color=BLUE, alpha=0.75)
+            axes.hlines(heights, low, high, color=INK, lw=1.6)
+            axes.set_yticks(heights, names if k == 0 else [""] * len(names))
+            axes.invert_yaxis()
+            axes.set_xlim(left=0.0)
+            axes.grid(visible=False, axis="y")
+            axes.set_xlabel(f"{name} [arcsec]")
+    return drawing_of(panels[0].figure, "parts of the error, across and about the boresight")
+
+
+def _bias(found: Assessment) -> Card:
+    """The constant turn."""
+    low, high = found.found.intervals.bias
+    rows = []
     for k, axis in enumerate(AXES):
-        biases.append(
-            (axis, within(float(parts.bias_arcsec[k]), float(low[k]), float(high[k]), ARCSEC))
-        )
-    texts = [table_of(biases), paragraph("95 % intervals in brackets, by the block bootstrap.")]
-    bias = KeyFigure(
-        measured(across, off, ARCSEC),
+        value = float(found.found.bias_arcsec[k])
+        rows.append((axis, within(value, float(low[k]), float(high[k]), ARCSEC)))
+    bias = _parts(found)[0]
+    assert bias.axes.cross is not None
+    half = float(bias.interval[1, 0] - bias.interval[0, 0]) / 2
+    figure = KeyFigure(
+        measured(bias.axes.cross, half, ARCSEC),
         "constant turn across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
     )
-    yield Card("Bias", bias, texts)
+    return Card("Bias", figure, [table_of(rows), paragraph("95 % intervals in brackets.", "small")])
+
+
+def _pixel(found: Assessment) -> Card:
+    """What repeats with the place in the pixel."""
+    parts = found.found
+    pixel = parts.components.pixel
+    texts = _about(parts.pixel_arcsec, parts.intervals.pixel)
+    texts.append(paragraph(f"{capital(pixel.detail or pixel.reason)}.", "small"))
+    return Card("Pixel error", _across(parts.pixel_arcsec, parts.intervals.pixel), texts)
+
+
+def _pictured(found: Assessment) -> Iterator[Card]:
+    """Field-of-view error and noise, one sigma an axis."""
+    parts = found.found
+    intervals = parts.intervals
     picture, reason = _field_map(found)
     texts = _about(parts.fov_arcsec, intervals.fov)
     if reason:
-        texts.append(paragraph(f"{reason}.", "small"))
+        texts.append(paragraph(f"{capital(reason)}.", "small"))
     figure = _across(parts.fov_arcsec, intervals.fov)
     yield Card("Field-of-view error", figure, texts, picture)
-    texts = _about(parts.pixel_arcsec, intervals.pixel)
-    texts.append(paragraph(f"{pixel.detail or pixel.reason}.", "small"))
-    yield Card("Pixel error", _across(parts.pixel_arcsec, intervals.pixel), texts)
     texts = _about(found.noise_arcsec, intervals.noise)
     texts.append(paragraph(f"Limit of the tracker's stars: {limit_text(found.limit_arcsec)}."))
     figure = _across(found.noise_arcsec, intervals.noise)
@@ -240,48 +358,47 @@ def _clock(found: Assessment) -> Card:
     drift = "Its rate cannot be told: the run does not turn enough."
     if clock.drift_told:
         rate = measured(1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm")
-        drift = f"It is fast by {rate}."
+        drift = f"Its rate less that of the run: {rate}."
     figure = KeyFigure(offset, "tracker's clock minus the run's, at the run's start")
     return Card("Clock", figure, [paragraph(drift)])
 
 
-def _beside(found: Assessment) -> Iterator[Card]:
+def _beside(found: Assessment) -> Card:
     """What of the errors is not the tracker's: the display's, the bench's, the glass's."""
     rows = [("display", display_text(found.display))]
     if found.certificate is not None:
         rows.append(("bench", bench_text(found)))
     if found.glass is not None:
         rows.append(("glass", found.glass.line()))
-    yield Card("What is not the tracker's", words=[table_of(rows)])
-    if found.cube is not None:
-        yield Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)])
+    return Card("What is not the tracker's", words=[table_of(rows)])
 
 
 def _slices(found: Assessment) -> Iterator[Card]:
     """The errors by rate and by magnitude."""
-    for name, unit, slices in (
-        ("rate", "deg/s", found.by_rate),
-        ("magnitude of the field", "V mag", found.by_magnitude),
+    for title, name, slices in (
+        ("By rate", "rate, deg/s", found.by_rate),
+        ("By the field's magnitude", "mean magnitude of the field, V mag", found.by_magnitude),
     ):
         if slices:
-            yield Card(f"By {name}", words=_slice_table(unit, slices))
+            yield Card(title, words=_slice_table(name, slices))
 
 
-def _slice_table(unit: str, slices: Sequence[Slice]) -> list[str]:
-    header = (f"from, {unit}", f"to, {unit}", *SLICE_COLUMNS)
-    rows = [astuple(rate_slice) for rate_slice in slices]
-    return [table_of(rows, header, 3), paragraph("The rms is about the bias.", "small")]
-
-
-def _whole_budget(found: Assessment) -> str:
-    """The rows of budget.csv."""
+def _slice_table(name: str, slices: Sequence[Slice]) -> list[str]:
     rows = []
-    for row in rows_of(found):
-        unit = "" if row.unit == COUNT else row.unit
-        rows.append((row.quantity, row.axis, row.value, unit, row.low_95, row.high_95))
-    header = ("quantity", "axis", "value", "unit", "from", "to")
-    note = paragraph("One sigma an axis, with 95 % intervals by the block bootstrap.")
-    return Card("Budget", words=[note, table_of(rows, header)]).html()
+    for part in slices:
+        errors = astuple(part)[2:]
+        rows.append((f"{part.low:.3g} to {part.high:.3g}", *errors))
+    return [
+        table_of(rows, (name, *SLICE_COLUMNS), 3),
+        paragraph("The rms is about the bias.", "small"),
+    ]
+
+
+def _all_figures(found: Assessment) -> str:
+    """The rows of budget.csv, folded on the screen."""
+    rows = list(rows_of(found))
+    details = details_of(f"{len(rows)} figures", figures_table(rows), printed=True)
+    return Card("All figures", words=[details]).html()
 
 
 def _over_time(found: Assessment) -> str:

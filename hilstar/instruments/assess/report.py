@@ -13,7 +13,7 @@ from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import DisplayCost, Slice
 from hilstar.instruments.assess.budget import Axes, DecomposedRun
 from hilstar.instruments.assess.figure_rows import FigureRow, limit_rows, limit_text, part_rows
-from hilstar.server.bench.certificate import Certificate, off_by
+from hilstar.server.bench.certificate_file import Certificate, off_by
 
 MAX_NAMED = 10
 MAX_SHARE_SIGMA = 0.5  # a share of the display's error that is less sure says nothing

@@ -18,14 +18,14 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.charts import chart
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.geometric.calibration import (
+from hilstar.instruments.calibrate.geometric.dots import DOT_PX, MIN_DOTS, read_plan
+from hilstar.instruments.calibrate.geometric.fit import MatchedDots
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
     SEED,
     dot_sigma_px,
     matched,
     nominal_of,
 )
-from hilstar.instruments.calibrate.geometric.dots import DOT_PX, MIN_DOTS, read_plan
-from hilstar.instruments.calibrate.geometric.fit import MatchedDots
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import measure_images, numbered, read_image
 from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of

@@ -231,7 +231,8 @@ def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
                 f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave"
                 " one of them"
             )
-    return {key: keys[key] for key in dict.fromkeys(reading.quantity.key for reading in readings)}
+    # in the order of the sheet again
+    return {reading.quantity.key: keys[reading.quantity.key] for reading in readings}
 
 
 def _checked(path: Path, sensor: SensorFile) -> SensorFile:

@@ -33,7 +33,7 @@ from hilstar.instruments.campaign.store import Directory, failures, require_parq
 from hilstar.instruments.campaign.sweep import LevelCount, counted, edge_figure, next_level
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from hilstar.server.bench.certificate import Certificate, CubeToBoresight, bench_certificate
+from hilstar.server.bench.certificate_file import Certificate, CubeToBoresight, bench_certificate
 
 NOT_TESTED = "not tested"
 PLAN_FILE, LEDGER = "plan.toml", "ledger.csv"

@@ -40,7 +40,7 @@ from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import SIGN, SIGN_STYLE, STATES
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, levels_text
-from hilstar.server.bench.certificate import off_by
+from hilstar.server.bench.certificate_file import off_by
 
 PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
 HEADER = (

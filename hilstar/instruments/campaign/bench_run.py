@@ -54,8 +54,8 @@ from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import Timetable
 from hilstar.server.loop import FaultyFrames, FrameLoop, Limit
 from hilstar.server.pacer import FrameSink, Moment, Pacer, Shown, ignore
+from hilstar.server.run_progress import Follower, Running
 from hilstar.server.screen.screen import DisplayPacer, Screen
-from hilstar.server.serve import Follower, Running
 
 ORDER_STREAM = 4  # stream of a plan's seed for the order of its cases
 BRIGHTEST = 5  # reported stars whose light is a case's signal

@@ -4,7 +4,7 @@ answers, its budget, and what costs it.
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hilstar.basics.files import write_whole
 from hilstar.basics.pages import (
@@ -14,8 +14,10 @@ from hilstar.basics.pages import (
     WARN,
     Card,
     KeyFigure,
+    Markup,
     Verdict,
     drawing_of,
+    escaped,
     figures_of,
     list_of,
     measured,
@@ -23,7 +25,7 @@ from hilstar.basics.pages import (
     paragraph,
     table_of,
 )
-from hilstar.instruments.assess.figure_rows import COUNT, FigureRow, limit_text
+from hilstar.instruments.assess.figure_rows import FigureRow, figures_table, limit_text
 
 PAGE_FILE = "campaign.html"
 MAX_REASONS = 20
@@ -32,19 +34,33 @@ ROWS_OF_FIGURES = (
     ("pixel error", "pixel error across"),
     ("noise", "noise across"),
 )
-BUDGET_COLUMNS = ("quantity", "axis", "value", "unit", "from", "to")
+COST_COLUMNS = ("parameter", "cost", "smallest", "largest")
 FAILED_CURE = "Mend what the reasons name, and run the plan again into another directory."
 WRONG_CURE = "Look at the cases whose column `wrong` is over 0, and at what costs the most."
 
 
+class MeasureCosts(NamedTuple):
+    """What costs the most of a measure: the first parameter's cost and what it is of, a row for
+    each parameter (COST_COLUMNS), and the chart.
+    """
+
+    cost: str
+    of: str
+    rows: Sequence[tuple[str, ...]]
+    chart: Any
+
+
 def write_campaign_page(
-    path: Path, summary: Mapping[str, Any], budget: Sequence[FigureRow], charts: Mapping[str, Any]
+    path: Path,
+    summary: Mapping[str, Any],
+    budget: Sequence[FigureRow],
+    costs: Mapping[str, MeasureCosts],
 ) -> None:
-    """Write the page of a campaign: its JSON object, the rows of budget.csv, and a figure of each
-    measure's costs. Raises InputError where it cannot be written.
+    """Write the page of a campaign: its JSON object, the rows of budget.csv, and the costs of
+    each measure. Raises InputError where it cannot be written.
     """
     parts = [figures_of(_figures(summary, budget))]
-    parts += [card.html() for card in _cards(summary, budget, charts)]
+    parts += [card.html() for card in _cards(summary, budget, costs)]
     title = f"Campaign of {summary['cases']} cases"
     write_whole(path, page_of(title, verdict_of(summary), parts))
 
@@ -78,7 +94,10 @@ def _figures(summary: Mapping[str, Any], budget: Sequence[FigureRow]) -> Iterato
     for quantity, of in ROWS_OF_FIGURES:
         row = across.get(quantity)
         if row is not None:
-            yield KeyFigure(_value(row), f"{of}, one sigma; \N{PLUS-MINUS SIGN} at 95 %")
+            if row.value is None:
+                yield KeyFigure(DASH, f"{of}: cannot be told")
+            else:
+                yield KeyFigure(_value(row), f"{of}, one sigma; \N{PLUS-MINUS SIGN} at 95 %")
 
 
 def _count(count: int, of: str, state: str) -> KeyFigure:
@@ -89,8 +108,7 @@ def _count(count: int, of: str, state: str) -> KeyFigure:
 
 def _value(row: FigureRow) -> str:
     """A row's value with the half width of its interval."""
-    if row.value is None:
-        return DASH
+    assert row.value is not None
     half = None
     if row.low_95 is not None and row.high_95 is not None:
         half = (row.high_95 - row.low_95) / 2
@@ -98,7 +116,9 @@ def _value(row: FigureRow) -> str:
 
 
 def _cards(
-    summary: Mapping[str, Any], budget: Sequence[FigureRow], charts: Mapping[str, Any]
+    summary: Mapping[str, Any],
+    budget: Sequence[FigureRow],
+    costs: Mapping[str, MeasureCosts],
 ) -> Iterator[Card]:
     """What failed, what costs the most, the budget, and the table."""
     if summary["failed"]:
@@ -106,22 +126,26 @@ def _cards(
     cure = ""
     if summary["wrong"]:
         cure = WRONG_CURE
-    for measure, figure in charts.items():
-        drawing = drawing_of(figure, f"cost of each parameter in {measure}")
-        yield Card(f"What costs the most: {measure}", words=[drawing], cure=cure)
+    for measure, found in costs.items():
+        drawing = drawing_of(found.chart, f"cost of each parameter in {measure}")
+        figure = KeyFigure(found.cost, found.of)
+        rows = [(_breakable(parameter), *texts) for parameter, *texts in found.rows]
+        table = table_of(rows, COST_COLUMNS)
+        yield Card(f"What costs the most: {measure}", figure, [table], drawing, cure)
+        cure = ""
     limit = paragraph(f"Limit of the tracker's stars: {limit_text(summary['limit_arcsec'])}.")
-    rows = []
-    for row in budget:
-        unit = row.unit
-        if unit == COUNT:
-            unit = ""
-        rows.append((row.quantity, row.axis, row.value, unit, row.low_95, row.high_95))
-    yield Card("Budget", words=[table_of(rows, BUDGET_COLUMNS), limit])
+    known = [row for row in budget if row.value is not None]
+    yield Card("Budget", words=[figures_table(known), limit])
     files = [("table", summary["table"]), ("SHA-256", summary["sha256"])]
     texts = [table_of(files)]
     if summary["notes"]:
         texts.append(list_of(summary["notes"]))
     yield Card("Table and notes", words=texts)
+
+
+def _breakable(key: str) -> Markup:
+    """A dotted key that may be broken behind its dots."""
+    return Markup(escaped(key).replace(".", ".<wbr>"))
 
 
 def _failures(because: Mapping[str, int]) -> Card:

@@ -2,6 +2,7 @@
 page that a person can sign.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,11 @@ from hilstar.basics.pages import (
     page_of,
     paragraph,
     table_of,
+    value_text,
 )
 from hilstar.basics.version import __version__
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.plan import CONDITION, Plan
+from hilstar.instruments.campaign.plan import CONDITION, QUANTITY_UNITS, Plan
 from hilstar.instruments.campaign.requirements import (
     MET,
     NOT_MET,
@@ -46,7 +48,7 @@ from hilstar.instruments.campaign.results import VARY, Columns, read_cases
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import bench_certificate, off_by
+from hilstar.server.bench.certificate_file import bench_certificate, off_by
 
 COLUMNS = ("quantity", "axis", "condition", "limit", "bound", "confidence", "cases", "verdict")
 COLOURS = {MET: GREEN, NOT_MET: RED, NOT_SHOWN: ORANGE}
@@ -155,10 +157,18 @@ def _verdicts(found: list[RequirementVerdict]) -> Card:
             more = f"about {each.more} more cases"
         chip = f'<span class="chip" data-state="{STATES[each.verdict]}">{each.verdict}</span>'
         confidence = f"{100 * each.require.confidence:g} %"
-        figures = (confidence, each.value, each.bound, each.cases)
+        unit = QUANTITY_UNITS[each.require.quantity]
+        figures = (confidence, _figure(each.value, unit), _figure(each.bound, unit), each.cases)
         rows.append((each.require.words, *figures, Markup(chip), more, each.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
     return Card("Verdicts", words=texts, cure=CURES[verdict_of(found)])
+
+
+def _figure(value: float | None, unit: str) -> str | None:
+    """A figure of the verdicts' table with its unit; None where it is not known."""
+    if value is None or not math.isfinite(value):
+        return None
+    return value_text(value, unit=unit)
 
 
 def _error_card(figure: Any) -> Card:

@@ -40,7 +40,7 @@ from hilstar.instruments.assess.figure_rows import (
     part_rows,
 )
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.page import PAGE_FILE, write_campaign_page
+from hilstar.instruments.campaign.page import PAGE_FILE, MeasureCosts, write_campaign_page
 from hilstar.instruments.campaign.store import failures, file_sha256
 from hilstar.server.bench.bench_file import BenchFile
 
@@ -403,14 +403,9 @@ def finding(found: list[Cost]) -> str:
             f" {_figure(first.overall, first)} in the median"
         )
 
-    def at(k: int) -> str:
-        place = first.places[k]
-        return (
-            f"{_figure(float(first.level[k]), first)} at"
-            f" {place if isinstance(place, str) else f'{place:.3g}'}"
-        )
-
-    return f"{first.parameter} costs the most of the {what}: {at(first.best)}, {at(first.worst)}"
+    smallest = _level_text(first, first.best)
+    largest = _level_text(first, first.worst)
+    return f"{first.parameter} costs the most of the {what}: {smallest}, {largest}"
 
 
 def _figure(value: float, cost: Cost) -> str:
@@ -441,6 +436,31 @@ def cost_chart(found: list[Cost]) -> Any:
             axis.set_xlabel(f"{cost.parameter}: costs {_figure(cost.cost, cost)}{sure}")
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
     return axes[0].figure
+
+
+def page_costs(found: list[Cost], figure: Any) -> MeasureCosts:
+    """The costs of one measure for the page, with their chart."""
+    first = found[0]
+    of = f"cost of {first.parameter}"
+    if not first.sure:
+        of = f"{of}: no more than the cases' noise"
+    rows = []
+    for cost in found:
+        text = _figure(cost.cost, cost)
+        if not cost.sure:
+            text = f"{text} (noise)"
+        rows.append(
+            (cost.parameter, text, _level_text(cost, cost.best), _level_text(cost, cost.worst))
+        )
+    return MeasureCosts(_figure(first.cost, first), of, rows, figure)
+
+
+def _level_text(cost: Cost, place: int) -> str:
+    """A bin's level, and where it is."""
+    where = cost.places[place]
+    if not isinstance(where, str):
+        where = f"{where:.3g}"
+    return f"{_figure(float(cost.level[place]), cost)} at {where}"
 
 
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
@@ -491,11 +511,12 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         )
     write_csv(table.with_name("sensitivity.csv"), names, rows)
     findings = []
-    charts = {}
+    measure_costs = {}
     for measure in dict.fromkeys(cost.measure for cost in varied_costs):
         of_it = [cost for cost in varied_costs if cost.measure == measure]
         if max(float(cost.level.max()) for cost in of_it) > 0:
-            figure = charts[WORDS[measure]] = cost_chart(of_it)
+            figure = cost_chart(of_it)
+            measure_costs[WORDS[measure]] = page_costs(of_it, figure)
             write_whole(table.with_name(f"sensitivity_{measure}.png"), png(figure))
             findings.append(finding(of_it))
     summary = {
@@ -507,7 +528,7 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         **budget,
         "findings": findings,
     }
-    write_campaign_page(table.with_name(PAGE_FILE), summary, budget_table, charts)
+    write_campaign_page(table.with_name(PAGE_FILE), summary, budget_table, measure_costs)
     return summary
 
 

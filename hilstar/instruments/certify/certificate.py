@@ -28,7 +28,7 @@ from hilstar.instruments.certify.model import THIRDS, true_deviations
 from hilstar.instruments.certify.readings import Reader
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import (
+from hilstar.server.bench.certificate_file import (
     KIND,
     ByTrials,
     Certificate,
@@ -62,8 +62,8 @@ MEASURANDS = {
     "star_flux": (
         "flux, with what the codes lose, and the errors of the catalogue and of the spectrum, mag"
     ),
-    "star_place_along": "place_along, with the catalogue's error, arcsec",
-    "star_place_across": "place_across, with the catalogue's error, arcsec",
+    "star_place_along": "the same as along x, with the catalogue's error, arcsec",
+    "star_place_across": "the same as along y, with the catalogue's error, arcsec",
 }
 UNKNOWN = {
     "latency": ("latency",),

@@ -23,15 +23,18 @@ from hilstar.basics.pages import (
     drawing_of,
     escaped,
     figures_of,
+    key_table,
     key_words,
+    keyed_rows,
     list_of,
     measured,
     page_of,
     paragraph,
     table_of,
+    value_text,
 )
 from hilstar.instruments.certify.model import THIRDS
-from hilstar.server.bench.certificate import Certificate, CertifiedFigure
+from hilstar.server.bench.certificate_file import Certificate, CertifiedFigure
 
 VERDICTS = {
     True: (OK, "Conforms"),
@@ -114,17 +117,16 @@ def _value(figure: CertifiedFigure) -> str:
 
 def _cards(found: Certificate, digest: str) -> Iterator[Card]:
     yield _figures(found)
-    yield Card("Certificate", words=[table_of(_heads(found, digest))])
+    yield Card("Certificate", words=[key_table(_heads(found, digest))])
     if found.cube is not None:
         yield Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)])
     yield _budget(found)
     yield Card("First order against trials", words=list(_both_ways(found)))
     yield Card("Not assessed", words=[list_of(found.not_assessed)])
-    identity = [(f"monitor: {key_words(key)}", str(value)) for key, value in found.monitor.items()]
-    identity += [
-        (f"collimator: {key_words(key)}", str(value)) for key, value in found.collimator.items()
-    ]
-    yield Card("Identity", words=[table_of(identity)])
+    identity = []
+    for part, keys in (("monitor", found.monitor), ("collimator", found.collimator)):
+        identity += [(f"{part}: {name}", text) for name, text in keyed_rows(keys)]
+    yield Card("Identity", words=[key_table(identity)])
     files = [(name, Markup(f"<code>{value}</code>")) for name, value in found.files.items()]
     yield Card("Files", words=[table_of(files, ("file", "SHA-256"))])
     rows = []
@@ -144,7 +146,7 @@ def _figures(found: Certificate) -> Card:
             " factor k by Student's t)."
         ),
         table_of(list(_worst(found)), WORST_COLUMNS, TWO_DIGITS + 1),
-        table_of(measurands),
+        key_table(measurands),
     ]
     cure = ""
     if found.conforms is False:
@@ -157,13 +159,16 @@ def _budget(found: Certificate) -> Card:
     bars = [_bars(found, quantity) for quantity in BARS]
     rows = []
     for budget_input in found.inputs:
+        dof = None
+        if budget_input.dof is not None:
+            dof = value_text(round(budget_input.dof))
         rows.append(
             (
                 budget_input.name,
                 budget_input.distribution,
                 budget_input.standard_uncertainty,
                 budget_input.unit,
-                budget_input.dof,
+                dof,
                 budget_input.source,
             )
         )
@@ -194,7 +199,7 @@ def statement(found: Certificate) -> str:
     )
 
 
-def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, ...]]:
+def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, object]]:
     yield "number", found.number
     yield "made, valid until", f"{found.made}, {found.valid_until}"
     yield "bench file", Markup(f"{escaped(found.bench)} <code>{found.bench_sha256}</code>")

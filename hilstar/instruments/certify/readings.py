@@ -23,8 +23,8 @@ from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.first_light.context import StepContext
 from hilstar.instruments.calibrate.first_light.focus import seen_sharpness
 from hilstar.instruments.calibrate.first_light.photometer import Assumed, Photometer, Readings
-from hilstar.instruments.calibrate.geometric.calibration import dot_sigma_px, psf_sigma_of
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen
+from hilstar.instruments.calibrate.geometric.geometry_fit import dot_sigma_px, psf_sigma_of
 from hilstar.instruments.calibrate.latency import pair, swap_to_square_ms
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry

@@ -18,6 +18,7 @@ from hilstar.basics.charts import (
     capital,
     chart,
     title_lines,
+    two_digits,
     write_csv,
 )
 from hilstar.basics.files import write_whole
@@ -153,11 +154,12 @@ class ChartPanel:
     def draw(self, axis: "Axes") -> None:
         """Draw the stars, the limits and the legend."""
         for kind, marker, colour in STYLES:
-            mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
+            points = [self.point(star) for star in self.of(kind)]
+            mags = [mag for mag, _, _ in points]
             if kind in self.rows:
                 heights = [self.rows[kind]] * len(mags)
             else:
-                heights = errors
+                heights = [error for _, error, _ in points]
             axis.plot(
                 mags,
                 heights,
@@ -252,7 +254,7 @@ def _figures(comparison: SkyComparison) -> Iterator[KeyFigure]:
 def _error(value: float | None, unit: str, of: str) -> KeyFigure:
     if value is None:
         return KeyFigure(DASH, of)
-    return KeyFigure(f"{value:.2g} {unit}", of)
+    return KeyFigure(f"{two_digits(value)} {unit}", of)
 
 
 def _cards(comparison: SkyComparison, figure: Any) -> Iterator[Card]:

@@ -188,19 +188,12 @@ class StarDifference:
     def name(self) -> str:
         """Its HIP number, those of its blend, or its place."""
         if self.hip:
-            hips, bodies = (
-                [designation for designation in self.hip if isinstance(designation, kind)]
-                for kind in (int, str)
-            )
-            return " + ".join(
-                [
-                    *(
-                        f"HIP {designation}" if k == 0 else str(designation)
-                        for k, designation in enumerate(hips)
-                    ),
-                    *map(str, bodies),
-                ]
-            )
+            hips = [designation for designation in self.hip if isinstance(designation, int)]
+            bodies = [designation for designation in self.hip if isinstance(designation, str)]
+            parts = [*map(str, hips), *bodies]
+            if hips:
+                parts[0] = f"HIP {parts[0]}"
+            return " + ".join(parts)
         return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
 
     def line(self) -> str:
@@ -278,9 +271,8 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     nothing.
     """
     both = [star for star in stars if star.kind in ("same", "changed")]
-    missing, extra = (
-        [star for star in stars if star.kind == kind] for kind in ("missing", "extra")
-    )
+    missing = [star for star in stars if star.kind == "missing"]
+    extra = [star for star in stars if star.kind == "extra"]
     pairs = dict(_pairs(missing, extra))
     for here, there in pairs.items():  # stars that moved far are in both images
         old = missing[here]
@@ -370,7 +362,8 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
         pairs = [
             (k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k
         ]
-        here, there = (np.array([pair[k] for pair in pairs], dtype=np.intp) for k in (0, 1))
+        here = np.array([before for before, _ in pairs], dtype=np.intp)
+        there = np.array([after for _, after in pairs], dtype=np.intp)
         middle = old.mean(axis=0)
         motion = fitted_motion(old[here] - middle, new[there] - old[here], rank_for(len(pairs)))
         predicted = old + motion(old - middle)
@@ -439,20 +432,24 @@ class SkyComparison:
 
     @property
     def flux_error_mag(self) -> ErrorSpread:
-        """Of the stars that both images have."""
+        """The spread of the flux errors of stars that both images have."""
         return error_spread(
             np.array([abs(star.flux_error_mag) for star in self.of("same", "changed")])
         )
 
     @property
     def centroid_error_px(self) -> ErrorSpread:
-        """Of the stars that both images have."""
+        """The spread of the centroid errors of stars that both images have."""
         return error_spread(
             np.array([star.centroid_error_px for star in self.of("same", "changed")])
         )
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `hilstar compare`; infinite errors are null there."""
+        channels = {}
+        for name, channel in self.channels.items():
+            figures = channel.summary()
+            channels[name] = {key: figures[key] for key in figures if key in CHANNEL_KEYS}
         return {
             "stars": self.star_count,
             "flux_error_mag": asdict(self.flux_error_mag),
@@ -464,25 +461,24 @@ class SkyComparison:
             "widened": self.widened,
             "unmeasured": self.unmeasured,
             "common": None if self.common is None else self.common.summary(),
-            "bad": [
-                {
-                    "kind": star.kind,
-                    "hip": star.hip,
-                    "x_px": star.x_px,
-                    "y_px": star.y_px,
-                    "flux_e_per_s": star.flux_e_per_s,
-                }
-                | {"flux_error_mag": star.flux_error_mag, "dx_px": star.dx_px, "dy_px": star.dy_px}
-                for star in self.bad
-            ],
+            "bad": [_summary_of(star) for star in self.bad],
             "same": self.same,
-            "channels": {
-                name: {
-                    key: value for key, value in channel.summary().items() if key in CHANNEL_KEYS
-                }
-                for name, channel in self.channels.items()
-            },
+            "channels": channels,
         }
+
+
+def _summary_of(star: StarDifference) -> dict[str, Any]:
+    """A star that differs, in the JSON object of `hilstar compare`."""
+    return {
+        "kind": star.kind,
+        "hip": star.hip,
+        "x_px": star.x_px,
+        "y_px": star.y_px,
+        "flux_e_per_s": star.flux_e_per_s,
+        "flux_error_mag": star.flux_error_mag,
+        "dx_px": star.dx_px,
+        "dy_px": star.dy_px,
+    }
 
 
 def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str]:

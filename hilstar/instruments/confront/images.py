@@ -254,10 +254,10 @@ def _exif(exif: Any) -> tuple[int | None, float | None]:
 
 
 def parse_utc(text: str) -> int:
-    """The UTC of `--at`. Raises InputError."""
+    """The UTC of `--taken`. Raises InputError."""
     t_ns = utc_ns(text)
     if t_ns is None:
         raise InputError(
-            f"--at {shortened(text)}: is no UTC; write one such as --at 2019-07-29T20:47:26"
+            f"--taken {shortened(text)}: is no UTC; write one such as --taken 2019-07-29T20:47:26"
         )
     return t_ns

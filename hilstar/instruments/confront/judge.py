@@ -18,8 +18,8 @@ from hilstar.basics.units import MAD_TO_SIGMA as MAD
 from hilstar.basics.units import flux_ratio
 from hilstar.instruments.confront.background import EIGHT_NEIGHBOURS, source_mask
 from hilstar.instruments.confront.light import BRIGHT_V_MAG
+from hilstar.instruments.confront.photographed_sky import planets_seen
 from hilstar.instruments.confront.session import MATCH_PX, Session, Shot
-from hilstar.instruments.confront.sky import planets_seen
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.layers.view import STILL
 from hilstar.server.bench.bench_file import read_bench_file

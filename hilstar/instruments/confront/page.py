@@ -41,10 +41,11 @@ from hilstar.instruments.confront.judge import Verdict as PhotoVerdict
 from hilstar.instruments.confront.light import BRIGHT_V_MAG
 from hilstar.instruments.confront.report import Confronted
 from hilstar.instruments.confront.session import Session
+from hilstar.sky.catalog import label_of
 
-MAX_SIDE_PX = 960
+MAX_SIDE_PX = 1200
 # Sigmas of the background between which a picture's greys lie: the sky's noise is nearly black.
-BLACK, WHITE = 1.0, 60.0
+BLACK, WHITE = 2.0, 30.0
 RESIDUAL = 5.0
 JPEG_QUALITY = 82
 MAX_ROWS = 40
@@ -71,9 +72,10 @@ def page_pictures(session: Session, verdict: PhotoVerdict) -> Pictures:
     noise = np.sqrt(session.pixels.variance_dn2(shot.level.level))
     in_sigmas = [(part - shot.level.level) / noise for part in (shot.photo.dn, verdict.predicted)]
     top = math.asinh(WHITE)
-    greys = [
-        255 * np.clip(np.arcsinh(np.clip(part - BLACK, 0, None)) / top, 0, 1) for part in in_sigmas
-    ]
+    greys = []
+    for part in in_sigmas:
+        above = np.clip(brightest(part, MAX_SIDE_PX) - BLACK, 0, None)
+        greys.append(255 * np.clip(np.arcsinh(above) / top, 0, 1))
     greys.append(255 * np.clip(verdict.residual / (2 * RESIDUAL) + 0.5, 0, 1))
     height, width = verdict.residual.shape
     rows = np.linspace(0, height, 13).astype(int)
@@ -83,6 +85,18 @@ def page_pictures(session: Session, verdict: PhotoVerdict) -> Pictures:
     return Pictures(
         tuple(_jpeg(grey) for grey in greys), sums / np.outer(np.diff(rows), np.diff(columns))
     )
+
+
+def brightest(image: FloatArray, max_side_px: int) -> FloatArray:
+    """An image (h, w) made smaller by a whole factor, until it fits: each point is the brightest
+    of its pixels, for a mean would lose the stars.
+    """
+    factor = math.ceil(max(image.shape) / max_side_px)
+    if factor == 1:
+        return image
+    edges = [np.arange(0, size, factor) for size in image.shape]
+    rows = np.maximum.reduceat(image, edges[0], axis=0)
+    return np.asarray(np.maximum.reduceat(rows, edges[1], axis=1))
 
 
 def _jpeg(grey: FloatArray) -> bytes:
@@ -211,8 +225,9 @@ def _frame(verdict: PhotoVerdict, pictures: Pictures) -> str:
     buttons = "".join(f'<button type="button">{name}</button> ' for name in names)
     note = paragraph(
         f"Names: the {MAX_NAMED} brightest stars. Squares: sources over {LISTED_SNR:g} sigmas that"
-        " nothing explains. Circles: stars that are missing. Black is the sky's noise, white"
-        f" {WHITE:g} sigmas above it; of the residual -{RESIDUAL:g} and +{RESIDUAL:g} sigmas.",
+        f" nothing explains. Circles: stars that are missing. Black is {BLACK:g} sigmas"
+        f" above the sky, white {WHITE:g} more; of the residual -{RESIDUAL:g} and +{RESIDUAL:g}"
+        " sigmas. In a smaller picture each point is the brightest of its pixels.",
         "small",
     )
     views = f'<div class="views">{images}{over}</div>'
@@ -234,7 +249,8 @@ def _name(row: StarRow, width: int) -> str:
         x = row.x_px - size
         anchor = "end"
     place = f'x="{x:.0f}" y="{row.y_px + size / 3:.0f}" font-size="{size:.1f}"'
-    return f'<text {place} text-anchor="{anchor}" fill="#ffd24a">{escaped(row.name)}</text>'
+    name = label_of(row.hip) or row.name
+    return f'<text {place} text-anchor="{anchor}" fill="#ffd24a">{escaped(name)}</text>'
 
 
 def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
@@ -376,6 +392,9 @@ def _transfer(session: Session) -> str:
 
 
 def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -> str:
+    from matplotlib.colors import TwoSlopeNorm
+
+    about_one = TwoSlopeNorm(1.0, 0.5, 2.0)  # white where the noise explains the residuals
     chi2 = [verdict.background_chi2 for verdict in verdicts]
     columns = min(len(verdicts), 4)
     rows = math.ceil(len(verdicts) / columns)
@@ -388,7 +407,7 @@ def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -
         finding, rows, columns, share_x=False, note=note, height_inch=1.2 + 2.1 * rows
     ) as panels:
         for axes, verdict, views in zip(panels, verdicts, pictures, strict=False):
-            drawn = axes.imshow(views.chi2_map, vmin=0.5, vmax=2.0, cmap="RdBu_r", aspect="auto")
+            drawn = axes.imshow(views.chi2_map, norm=about_one, cmap="RdBu_r", aspect="auto")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.grid(visible=False)

@@ -13,9 +13,14 @@ from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
 from hilstar.instruments.confront.excess import split_excess
-from hilstar.instruments.confront.files import NAMES, fixed_camera, read_tracker_file, write_tracker
 from hilstar.instruments.confront.images import Photograph, paged, read_photographs
 from hilstar.instruments.confront.judge import Judge, Verdict
+from hilstar.instruments.confront.measured_bench import (
+    NAMES,
+    fixed_camera,
+    read_tracker_file,
+    write_tracker,
+)
 from hilstar.instruments.confront.page import page_pictures, write_page
 from hilstar.instruments.confront.report import Confronted, failures_of, lines_of, words_of
 from hilstar.instruments.confront.session import run_session

@@ -53,13 +53,13 @@ from hilstar.instruments.confront.lost_in_space import (
     nearest_once,
     solve_lost,
 )
+from hilstar.instruments.confront.photographed_sky import DatedSky, dated_sky
 from hilstar.instruments.confront.photon_transfer import (
     PixelFit,
     fit_pedestal,
     fit_pixels,
     transfer_points,
 )
-from hilstar.instruments.confront.sky import DatedSky, dated_sky
 from hilstar.instruments.confront.star_psf import (
     HALF,
     MEAN_BV_MAG,

@@ -38,13 +38,12 @@ def json_answer(answer: Answer) -> bytes:
             fields[name] = vector.tolist()
     if answer.rms_arcsec is not None:
         fields["rms_arcsec"] = answer.rms_arcsec
-    fields["centroids"] = [
-        [part if part is None else round(part, STAR_DECIMALS) for part in star]
-        for star in answer.centroids
-    ]
-    for star in fields["centroids"]:
-        if star[-1] is None:
-            star.pop()
+    fields["centroids"] = []
+    for star in answer.centroids:
+        numbers = [None if part is None else round(part, STAR_DECIMALS) for part in star]
+        if star.hip is None:
+            numbers.pop()
+        fields["centroids"].append(numbers)
     return msgspec.json.encode(fields)
 
 

@@ -207,9 +207,7 @@ def zero_point_mag(bench: Bench) -> float:
 
 
 def _like_the_sun(bench: Bench) -> IntArray:
-    """The stars of its colour, or else the nearest to it: where there are stars, none of these
-    is far from it.
-    """
+    """The stars within LIKE_SOLAR_BV of the Sun's B-V, or else those nearest to it."""
     distance = np.abs(bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)] - SOLAR_BV)
     return np.flatnonzero(distance <= max(LIKE_SOLAR_BV, float(distance.min())))
 
@@ -295,14 +293,14 @@ def write_report(directory: Path, found: LightBudget) -> None:
     """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot
     be written.
     """
-    rows = [asdict(row) for row in found.rows]
-    for row in rows:  # each kind of centroider has a column of its own
-        row.update({f"axis_rms_px_{kind}": value for kind, value in row.pop("axis_rms_px").items()})
-    write_csv(
-        directory / "budget.csv",
-        list(rows[0]),
-        [["" if v is None else v for v in row.values()] for row in rows],
-    )
+    rows = []
+    for row in found.rows:
+        columns = asdict(row)
+        # each kind of centroider has a column of its own
+        for kind, value in columns.pop("axis_rms_px").items():
+            columns[f"axis_rms_px_{kind}"] = value
+        rows.append(columns)
+    write_csv(directory / "budget.csv", list(rows[0]), [list(row.values()) for row in rows])
     reach = found.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
     finding = (
         f"{found.bits} bits, {found.method}: from V = {found.clips_v_mag:.1f}, where stars clip,"

@@ -70,8 +70,8 @@ class ErrorSplit:
 
     @property
     def psf(self) -> FloatArray:
-        """What neither takes: the PSF's shape against pixel and window, and noise where the
-        errors have it.
+        """The part that is neither distortion nor colour: of the PSF's shape in pixels and window,
+        and of noise where the errors have it.
         """
         return np.asarray(self.total - self.distortion - self.colour)
 

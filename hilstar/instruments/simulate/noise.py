@@ -12,7 +12,7 @@ over places on the detector.
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,15 +92,13 @@ Table = npt.NDArray[np.void]
 
 
 def in_mosaic(mosaic: FloatArray, bayer: str, shape: tuple[int, int]) -> FloatArray:
-    """What pixels (2, h, w) have of a star and of the mean pixel's background, by those of red,
-    green and blue (2, 3).
+    """The shares of a star and of the background that a mosaic's pixels (2, h, w) collect, relative
+    to the mean pixel, by the shares of red, green and blue (2, 3).
     """
-    return np.array(
-        [
-            in_pixels([np.full(shape, channel_value) for channel_value in row_values], bayer)
-            for row_values in mosaic
-        ]
-    )
+    star, background = mosaic
+    star_images = [np.full(shape, share) for share in star]
+    background_images = [np.full(shape, share) for share in background]
+    return np.stack([in_pixels(star_images, bayer), in_pixels(background_images, bayer)])
 
 
 class NoisyStar:
@@ -148,8 +146,8 @@ class NoisyStar:
         self._pairs = np.einsum("ifp,jfp->fpij", by, by).reshape(count, -1, 16)
 
     def _patterns(self) -> FloatArray:
-        """What pixels have of star and background (2, n, side, side) where a star is before each
-        of a mosaic's n pixels.
+        """The shares of star and background of the pixels in a window, (2, n, side, side), for a
+        star on each of the n pixels of a mosaic's pattern.
         """
         if self.mosaic is None or self.detector.bayer is None:
             return np.ones((2, 1, 1, 1))
@@ -557,13 +555,10 @@ def noise_budget(
             )
         counts.append(float(bounds[2].sum()))
         turns = turns_of(camera, field["x_px"], field["y_px"])
-        others = [
-            np.stack([np.interp(-np.log(star_e), -np.log(noise["star_e"][shown]), one)] * 2)
-            for one in measured
-        ]
-        curves.append(
-            np.stack([nea_arcsec(turns, one, bounds[2]) for one in [bounds[:2], *others]])
-        )
+        # by who finds the stars: the bounds, then what centroiders reach, the same on both axes
+        reached_px = [_at_rates(star_e, noise[shown], sigma_px) for sigma_px in measured]
+        sigmas_px = [bounds[:2], *(np.stack([sigma, sigma]) for sigma in reached_px)]
+        curves.append(np.stack([nea_arcsec(turns, sigma, bounds[2]) for sigma in sigmas_px]))
     faintest = min(
         config.sky.faintest_v_mag, math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG
     )
@@ -577,15 +572,26 @@ def noise_budget(
         rows=_rows({"v_mag": v_mag[shown]}, noise[shown], reached),
         stars=listed,
         nea=nea,
-        nea_arcsec={
-            kind: {way: nea[-1][f"{kind}_{way}_arcsec"] for way in ("across", "about")}
-            for kind in WHO
-        },
+        nea_arcsec=_by_way(nea[-1]),
         channels=channels,
         found_v_mag=float(np.interp(-HALF_FOUND, -noise["detection"], v_mag)),
         found_stars=float(np.median(counts)),
         identified_share=float(np.mean(np.array(counts) >= IDENTIFIED)),
     )
+
+
+def _at_rates(star_e: FloatArray, noise: Table, values: FloatArray) -> FloatArray:
+    """A figure of the rows of a table at other stars' electrons (n,)."""
+    return np.interp(-np.log(star_e), -np.log(noise["star_e"]), values)
+
+
+def _by_way(nea_row: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """The NEA of a row across and about the boresight, arcsec, by WHO finds the stars."""
+    by_way = {}
+    for kind in WHO:
+        across, about = nea_row[f"{kind}_across_arcsec"], nea_row[f"{kind}_about_arcsec"]
+        by_way[kind] = {"across": across, "about": about}
+    return by_way
 
 
 def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -632,10 +638,8 @@ def between(noise: Table, star_e: FloatArray) -> FloatArray:
 
 def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[dict[str, Any]]:
     columns = before | {name: noise[name] for name in NOISE_DTYPE.names or ()} | after
-    return [
-        dict(zip(columns, row, strict=True))
-        for row in zip(*(column.tolist() for column in columns.values()), strict=True)
-    ]
+    lists = [column.tolist() for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 
 
 def _nea_rows(

@@ -29,7 +29,7 @@ from hilstar.server.bench.monitor import bench_primaries
 from hilstar.server.bench.star_rates import named_channels
 from hilstar.tracker.mosaic import in_pixels
 
-POINTS_AT_ONCE = 400_000
+POINTS_AT_ONCE = 400_000  # bounds the memory: light of more points is spread part by part
 
 
 class Primary(NamedTuple):

@@ -69,11 +69,11 @@ class RowBeat:
         return self.phase_s + frame * self.period_s
 
     def shares(self, frame: int, screen_late_s: FloatArray, row_late_s: FloatArray) -> FloatArray:
-        """What a frame gives to places (n,) of an exposure's light, relative to the mean light of
-        the screen.
+        """The share (n,) that a frame has of the light of an exposure at n places, relative to the
+        screen's mean light.
 
         `screen_late_s` (n,) is how long after its middle row the screen lights a place,
-        `row_late_s` (n,) how long after its own the tracker exposes it.
+        `row_late_s` (n,) how long after its middle row the tracker exposes it.
         """
         begin = self.begin_s(frame) + screen_late_s
         exposed = row_late_s - self.rows.hold_s / 2

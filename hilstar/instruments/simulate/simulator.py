@@ -237,6 +237,7 @@ class Simulator(Closing):
         canvas = self.canvas
         view = rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
+        # without a generator there is no noise, and stars do not twinkle
         if self.moving is not None and self.moving.air is not None and rng is not None:
             stars = self.moving.air.twinkling(stars, self.moving.utc_ns(view.t_ns), exposure_s, rng)
         layers = self._layers

@@ -51,12 +51,12 @@ MAX_ERRORS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Planted:
-    """What is wrong with the tracker: a bias about cam x, y, z, and one sigma of errors that
-    repeat; shares; seconds.
+    """Errors planted in the simulated tracker, so that an assessment can be held against them.
 
-    Field-of-view error is a wave of 400 px of the star field's place, pixel error one of a pixel,
-    each `_arcsec` about x and y, and ROLL times that about the boresight. `wrong` is the share of
-    answers that are any attitude. Silence begins `after_s` and lasts `silent_s`.
+    `bias_arcsec` is a constant turn about cam x, y and z. `fov_arcsec` and `pixel_arcsec` are one
+    sigma about x and y, and ROLL times that about the boresight, of errors that repeat: a wave of
+    400 px of the star field's place, and one of a pixel. `wrong` is the share of answers that are
+    any attitude. Silence begins `after_s` and lasts `silent_s`.
     """
 
     bias_arcsec: tuple[float, ...] = (0.0, 0.0, 0.0)

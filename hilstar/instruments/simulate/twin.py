@@ -23,7 +23,7 @@ from hilstar.display.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import LitLight, lit_light, primary_levels
-from hilstar.display.response import Response, table_response
+from hilstar.display.response import Levels, Response, table_response
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import DisplayColours, TwinOptics, seen_primaries
 from hilstar.instruments.simulate.shutter import rolled, rolling_light
@@ -63,27 +63,39 @@ def exposure_lights(
     count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
     exposed = bench.quantiser.exposure(first_frame % PHASES, count)
     size = frame.levels.shape[:2]
-    total = [
-        [np.zeros(size if len(exposed) > 1 else 0) for _ in panel.primaries or (panel,)]
-        for panel in panels
-    ]
+    total: list[list[FloatArray]] = []  # by panel and primary, over the frames
     for number in range(exposed.stop):
         levels = frame.levels
         if number:
             sprites = bench.light(bench.view(frame.q_icrs_to_cam, None, frame.t_ns), faults)
             levels = bench.draw_sprites(sprites, first_frame + number).levels
-        if number in exposed:
-            lit = [
-                [lit_light(*primary_level) for primary_level in primary_levels(levels, panel)]
-                for panel in panels
-            ]
-            if len(exposed) == 1:
-                return lit
-            for whole, part in zip(itertools.chain(*total), itertools.chain(*lit), strict=True):
-                whole.ravel()[part.place] += part.e_per_s
-    return [
-        [LitLight.of(light / len(exposed)) for light in primary_level] for primary_level in total
-    ]
+        if number not in exposed:
+            continue
+        lit = [_primaries_lit(levels, panel) for panel in panels]
+        if len(exposed) == 1:
+            return lit
+        if not total:
+            total = [_dark_images(len(primaries), size) for primaries in lit]
+        for whole, part in zip(itertools.chain(*total), itertools.chain(*lit), strict=True):
+            whole.ravel()[part.place] += part.e_per_s
+    return [_mean_lights(primaries, len(exposed)) for primaries in total]
+
+
+def _dark_images(count: int, shape: tuple[int, ...]) -> list[FloatArray]:
+    return [np.zeros(shape) for _ in range(count)]
+
+
+def _primaries_lit(levels: Levels, panel: Panel) -> list[LitLight]:
+    """The light of each primary of a panel at levels."""
+    lights: list[LitLight] = []
+    for primary_level, primary in primary_levels(levels, panel):
+        lights.append(lit_light(primary_level, primary))
+    return lights
+
+
+def _mean_lights(totals: Sequence[FloatArray], frames: int) -> list[LitLight]:
+    """The mean light of each primary, of its sum over frames (height, width)."""
+    return [LitLight.of(total / frames) for total in totals]
 
 
 def true_panel(bench: Bench) -> Panel:

@@ -39,7 +39,7 @@ from hilstar.instruments.study.row_charts import (
     looks_of,
     row_panels,
 )
-from hilstar.instruments.study.settings import FULL_HD, Table, study_bench
+from hilstar.instruments.study.study_benches import FULL_HD, Table, study_bench
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, Spent, in_turn
 from hilstar.optics.camera import Camera
 from hilstar.optics.extended import DiscView, Pose, disc_lights

@@ -239,14 +239,12 @@ def _left_by(
             return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
 
         for count in counts:
-            errors = []
+            error_rows = []
             for begin in BEGINS:
-                errors.append(
-                    judge.errors((until(begin + count) - until(begin)) / count, share, kinds)
-                )
-            error_rows = [
-                (e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors
-            ]
+                mean_light = (until(begin + count) - until(begin)) / count
+                errors = judge.errors(mean_light, share, kinds)
+                axis_rms_px = [errors.axis_rms_px(kind) for kind in kinds]
+                error_rows.append((errors.flux_rms_mag, *axis_rms_px))
             rms = np.sqrt(np.mean(np.square(error_rows), axis=0)).tolist()
             yield OverFrames(name, mag, steps, method, count, *rms)
 

@@ -27,7 +27,7 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import magnitude
 from hilstar.display.response import Levels, srgb_response
 from hilstar.instruments.simulate.budget import RED_NM, SOLAR_BV
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.study_benches import (
     GLASS,
     Isolation,
     bench_text,
@@ -265,33 +265,29 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[F
     """Lone stars of frames: what is wanted, the shares of primaries shown (3,), light over
     wanted (1,), and place off (2,).
     """
-    light, rgb = srgb_response(bench.config.monitor.bits).light, bench.calibration.response.rgb
-    white, stars, rng = (
-        colours.of_white * bench.flux_at_white_e_per_s,
-        bench.shown_stars,
-        np.random.default_rng(1),
-    )
+    light = srgb_response(bench.config.monitor.bits).light
+    rgb = bench.calibration.response.rgb
+    white = colours.of_white * bench.flux_at_white_e_per_s
+    stars = bench.shown_stars
+    rng = np.random.default_rng(1)
     for _ in range(fields):
         q = from_radec_roll_deg(
             rng.uniform(0, 360), math.degrees(math.asin(rng.uniform(-1, 1))), 0.0
         )
         levels, sprites = bench.draw(q).levels, bench.sprites(q, stars)
-        codes = (
-            levels
-            if levels.ndim == 3
-            else np.repeat(levels[..., None], 3, axis=2)
-            if rgb is None
-            else rgb[levels]
-        )
-        images = light[codes] * white
+        if levels.ndim == 3:
+            relative = light[levels]
+        elif rgb is None:
+            relative = np.repeat(light[levels][..., None], 3, axis=2)
+        else:
+            relative = light[rgb[levels]]
+        images = relative * white
         for number, window in lone_windows(sprites, sprites.x_px, sprites.y_px, FRAME_PX, LONE):
             by_primary = images[window].sum(axis=(0, 1))
             if not (BRIGHTEST_V_MAG < stars.v_mag[number] < FAINTEST_V_MAG and by_primary.any()):
                 continue
-            row, rate = (
-                int(np.flatnonzero(sprites.star == number)[0]),
-                float(stars.electrons_per_s[number]),
-            )
+            row = int(np.flatnonzero(sprites.star == number)[0])
+            rate = float(stars.electrons_per_s[number])
             middles = (
                 np.nan_to_num([centroid_px(images[..., k], window) for k in range(3)])
                 + colours.places_px

@@ -14,7 +14,7 @@ from hilstar.basics.charts import BLUE, MUTED, ORANGE, RED, chart, write_records
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.study_benches import (
     FULL_HD,
     GLASS,
     Isolation,
@@ -270,10 +270,11 @@ def economy_finding(comparisons: list[EffortComparison]) -> str:
             by_bits.setdefault(comparison.auto.bits, []).append(comparison.speed_up)
     depths = ", ".join(str(bits) for bits in sorted(by_bits))
     medians = ", ".join(f"{np.median(by_bits[bits]):.1f}" for bits in sorted(by_bits))
-    slowest, quickest = (extreme(one.speed_up for one in comparisons) for extreme in (min, max))
+    speed_ups = [comparison.speed_up for comparison in comparisons]
     return (
-        f"At {depths} bits auto effort is {medians} times as fast as full effort ({slowest:.1f} to"
-        f" {quickest:.1f} over all scenes and both tolerances), {within_words(comparisons)}"
+        f"At {depths} bits auto effort is {medians} times as fast as full effort"
+        f" ({min(speed_ups):.1f} to {max(speed_ups):.1f} over all scenes and both tolerances),"
+        f" {within_words(comparisons)}"
     )
 
 

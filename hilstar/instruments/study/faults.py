@@ -25,7 +25,13 @@ from hilstar.instruments.study.row_charts import (
     finite,
     name_places,
 )
-from hilstar.instruments.study.settings import FULL_HD, Isolation, Table, lone_windows, study_bench
+from hilstar.instruments.study.study_benches import (
+    FULL_HD,
+    Isolation,
+    Table,
+    lone_windows,
+    study_bench,
+)
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.extended import GlowLight
 from hilstar.optics.layers.fault_kinds import Freeze, Now, fault_of

@@ -18,7 +18,6 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import write_records
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.calibrate.geometric.calibration import matched
 from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots
 from hilstar.instruments.calibrate.geometric.fit import (
     BROWN_CONRADY,
@@ -30,6 +29,7 @@ from hilstar.instruments.calibrate.geometric.fit import (
     fit,
     held_out,
 )
+from hilstar.instruments.calibrate.geometric.geometry_fit import matched
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.instruments.study.row_charts import (

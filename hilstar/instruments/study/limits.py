@@ -29,7 +29,7 @@ from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.assess.bench_effects import turn_between
 from hilstar.instruments.study import codes
 from hilstar.instruments.study.predictors import ORION, predictors, rate_of, slew_attitude
-from hilstar.instruments.study.settings import held_out_errors, study_optics
+from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import brightest, max_stars
 from hilstar.server.bench.config import RenderSettings
@@ -125,7 +125,7 @@ class Limit:
 
     @property
     def fails(self) -> bool:
-        """Whether its error is over the tolerance somewhere."""
+        """Whether the error exceeds the tolerance at any stress."""
         return bool((self.error > self.tolerance).any())
 
     @property
@@ -316,7 +316,9 @@ def predicted_rms_arcsec(
 
 
 def old_packets(quick: bool) -> Limit:
-    """Prediction in a shaken swing, against the age of the newest packet."""
+    """Error of a predicted attitude, on a slew with jitter, against the age of the newest
+    packet.
+    """
     ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
     says = "packets over {} ms old"
@@ -324,7 +326,9 @@ def old_packets(quick: bool) -> Limit:
 
 
 def few_packets(quick: bool) -> Limit:
-    """The same without any delay, against the packets a second."""
+    """Error of a predicted attitude, on the same slew and without delay, against the rate of
+    packets.
+    """
     rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
     return Limit(

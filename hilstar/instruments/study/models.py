@@ -43,14 +43,14 @@ from hilstar.instruments.study.row_charts import (
     draw_curves,
     write_columns,
 )
-from hilstar.instruments.study.settings import (
+from hilstar.instruments.study.sky_figures import FIGURES as SKY_FIGURES
+from hilstar.instruments.study.study_benches import (
     APERTURE_MM,
     MAX_RELIABLE_VI_MAG,
     held_out_by_type,
     held_out_errors,
     study_optics,
 )
-from hilstar.instruments.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.sky.catalog import Catalog, load_catalog
 from hilstar.sky.electrons import (
     REFERENCE_TEMPERATURE_K,
@@ -215,7 +215,7 @@ class MeasuredValue:
 
 
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
-    """What each error of table 2.3 is of, by the error's name."""
+    """The figure that each error of table 2.3 belongs to, by the error's name."""
     pm_ra = catalog.pm_ra_cosdec_mas_yr
     pm_dec = catalog.pm_dec_mas_yr
     return {
@@ -373,26 +373,17 @@ def detector_laws(directory: Path) -> ChartFinding:
     """
     kelvin = np.arange(230.0, 300.5, 1.0)
     hz = np.geomspace(1e4, 1e7, 61)
-    dark = {
-        name: np.array(
-            [
-                203 * structs.replace(TABLE_4_2_DARK, temperature_k=t, **law).dark_factor
-                for t in kelvin.tolist()
-            ]
-        )
-        for name, law in DARK_LAWS.items()
-    }
-    read = {
-        corner: np.array(
-            [
-                structs.replace(
-                    TABLE_4_2_DARK, readout_hz=f, read_noise_corner_hz=corner
-                ).read_noise_now_e
-                for f in hz.tolist()
-            ]
-        )
-        for corner in CORNERS_HZ
-    }
+    dark = {}
+    for name, law in DARK_LAWS.items():
+        detectors = [
+            structs.replace(TABLE_4_2_DARK, temperature_k=t, **law) for t in kelvin.tolist()
+        ]
+        dark[name] = np.array([203 * detector.dark_factor for detector in detectors])
+    read = {}
+    for corner_hz in CORNERS_HZ:
+        detector = structs.replace(TABLE_4_2_DARK, read_noise_corner_hz=corner_hz)
+        detectors = [structs.replace(detector, readout_hz=f) for f in hz.tolist()]
+        read[corner_hz] = np.array([detector.read_noise_now_e for detector in detectors])
     at = {name: float(values[kelvin == COLD_K][0]) for name, values in dark.items()}
     text = (
         f"Of 203 e-/s at 293 K (table 4.2) {COLD_K:.0f} K leaves {at['e2v AIMO']:.0f} by e2v's AIMO"
@@ -471,18 +462,17 @@ def spectra(directory: Path) -> ChartFinding:
     figures = {
         key: np.percentile(100 * np.abs(error[sure]), (50, 95)) for key, error in errors.items()
     }
-    text = "Median error of the electron rate (95 %), V-I < 2.5: " + "; ".join(
-        f"{SENSORS[sensor].split()[0]} {real[0]:.1f} % ({real[1]:.1f} %) by real spectra and V-I,"
-        f" {body[0]:.1f} % ({body[1]:.1f} %) by black bodies and B-V"
-        for sensor in SENSORS
-        for real, body in [
-            (figures[sensor, HELD_OUT], figures[sensor, "black body, ballesteros2012"])
-        ]
-    )
-    real, body = (
-        max(figures[s, name][1] for s in SENSORS)
-        for name in (HELD_OUT, "black body, ballesteros2012")
-    )
+    by_sensor = []
+    for sensor in SENSORS:
+        real, real_95 = figures[sensor, HELD_OUT]
+        body, body_95 = figures[sensor, "black body, ballesteros2012"]
+        by_sensor.append(
+            f"{SENSORS[sensor].split()[0]} {real:.1f} % ({real_95:.1f} %) by real spectra and V-I,"
+            f" {body:.1f} % ({body_95:.1f} %) by black bodies and B-V"
+        )
+    text = f"Median error of the electron rate (95 %), V-I < 2.5: {'; '.join(by_sensor)}"
+    worst_real = max(figures[sensor, HELD_OUT][1] for sensor in SENSORS)
+    worst_body = max(figures[sensor, "black body, ballesteros2012"][1] for sensor in SENSORS)
     late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
     of_late = {key: np.percentile(100 * np.abs(error[late]), 95) for key, error in errors.items()}
     text += "; late M giants (95 %), " + "; ".join(
@@ -491,8 +481,8 @@ def spectra(directory: Path) -> ChartFinding:
         for sensor in SENSORS
     )
     finding = (
-        f"Real spectra by V-I give the electron rate within {real:.1f} % for 95 % of stars to V-I ="
-        f" {MAX_RELIABLE_VI_MAG:g}, black bodies by B-V within {body:.0f} %"
+        f"Real spectra by V-I give the electron rate within {worst_real:.1f} % for 95 % of stars to"
+        f" V-I = {MAX_RELIABLE_VI_MAG:g}, black bodies by B-V within {worst_body:.0f} %"
     )
     note = (
         f"A mark a Pickles spectrum, each held out in turn; {(~sure).sum()} are redder than the"
@@ -527,15 +517,11 @@ def spectra(directory: Path) -> ChartFinding:
 
 def zero_points(directory: Path) -> ChartFinding:
     """Electrons of a V = 0 star of 9602 K by zero point and weighting."""
-    rates = {
-        sensor: np.array(
-            [
-                dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, study_optics(sensor), p)
-                for p in SETTINGS
-            ]
-        )
-        for sensor in SENSORS
-    }
+    rates = {}
+    for sensor in SENSORS:
+        optics = study_optics(sensor)
+        of_settings = [dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, optics, p) for p in SETTINGS]
+        rates[sensor] = np.array(of_settings)
     mag = {sensor: magnitude(rate / rate[0]) for sensor, rate in rates.items()}
     base = rates["ccd47-20"]
     cost = mag["ccd47-20"]

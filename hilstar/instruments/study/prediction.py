@@ -115,9 +115,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     load = others.load()
     write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
-    default = next(
-        o for o in usual if o.method == next(g.name for g in predictors() if g.is_default)
-    )
+    default_name = next(predictor.name for predictor in predictors() if predictor.is_default)
+    default = next(o for o in usual if o.method == default_name)
     hold = next(o for o in usual if o.method == "hold")
     finding = (
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is"
@@ -229,10 +228,11 @@ def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) 
     """The frequency above which the newest attitude is nearer than one predicted by its rate;
     infinite for none.
     """
-    mine = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
-    by = {way: [s.residual for s in mine if s.way == way] for way in WAYS}
-    worse_by = np.array(by["rate"]) - np.array(by["newest"])
-    hz = [s.jitter_hz for s in mine if s.way == "rate"]
+    alike = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
+    by_rate = [s for s in alike if s.way == "rate"]
+    by_newest = [s for s in alike if s.way == "newest"]
+    worse_by = np.array([s.residual for s in by_rate]) - np.array([s.residual for s in by_newest])
+    hz = [s.jitter_hz for s in by_rate]
     for (low, under), (high, over) in pairwise(zip(hz, worse_by, strict=True)):
         if under <= 0 < over:
             return float(low * (high / low) ** (under / (under - over)))

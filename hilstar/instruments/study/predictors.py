@@ -119,7 +119,7 @@ class Movement:
 
     @property
     def turns(self) -> bool:
-        """Whether it is not at rest."""
+        """Whether the camera turns at all."""
         return self.rate_deg_s != 0
 
     @property

@@ -194,7 +194,9 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CentroiderErrors:
-    """What round and exact codes do to a place by one centroider, rms along an axis, px."""
+    """Centroid errors with the codes of `round` and `exact` by one centroider, rms along an axis,
+    px.
+    """
 
     bits: int
     centroider: str
@@ -203,7 +205,7 @@ class CentroiderErrors:
 
     @property
     def share(self) -> float:
-        """What exact leaves of the error that round makes."""
+        """The error with `exact` relative to that with `round`."""
         return self.exact_px / self.round_px
 
 

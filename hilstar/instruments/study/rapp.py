@@ -17,7 +17,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S
 from hilstar.instruments.study.fields import Field, fields_of
-from hilstar.instruments.study.settings import study_optics
+from hilstar.instruments.study.study_benches import study_optics
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import tracker_camera

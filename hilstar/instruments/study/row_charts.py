@@ -159,7 +159,9 @@ def draw_rows(
 def row_panels(
     path: Path, finding: str, spec: ChartSpec, rows: Sequence[Any], load: Load = IDLE
 ) -> "Iterator[list[Axes]]":
-    """The same, and its panels, for what a spec does not have; written when the context ends."""
+    """The panels of a chart of rows, for what a ChartSpec does not have; the chart is written when
+    the context ends.
+    """
     down = len(spec.panels) // spec.columns
     note = load.note(spec.note)
     with chart(path, finding, down, spec.columns, note=note, **spec.layout) as grid:

@@ -67,7 +67,9 @@ class Load:
         return f"{note} {capital(self.caution)}."
 
     def judged(self, lines: Sequence[str]) -> Judged:
-        """What a study of times found: on a busy machine with the caution, and not judged."""
+        """The lines of a study of times and True; on a busy machine the caution with them, and
+        None, as such times are not judged.
+        """
         if self.busy:
             return [*lines, self.caution], None
         return list(lines), True
@@ -111,10 +113,10 @@ def in_turn(
 
 def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
     """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
-    return {
-        name: float(np.median([taken_time.wall_ms for taken_time in took]))
-        for name, took in in_turn(works, rounds).items()
-    }
+    medians = {}
+    for name, times in in_turn(works, rounds).items():
+        medians[name] = float(np.median([taken.wall_ms for taken in times]))
+    return medians
 
 
 def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:

@@ -34,7 +34,7 @@ from hilstar.instruments.campaign.display_tracker import DisplayTracker
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.shutter import S_PER_US
-from hilstar.instruments.study import settings
+from hilstar.instruments.study import study_benches
 from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.row_charts import (
     ChartSpec,
@@ -94,7 +94,7 @@ PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
 MARKERS = "osd^"
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
-ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
+ISOLATION = study_benches.Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 QUICK_RATES_DEG_S = (2.0,)
 DRAW_TO_SWAP_S = 0.010
@@ -140,23 +140,23 @@ class StripePoint:
 def stripe_points(case: StripeCase) -> list[StripePoint]:
     """The rows of one case, every so many."""
     exposure_s = case.refreshes / REFRESH_HZ
-    tables: dict[str, settings.Table] = {
+    tables: dict[str, study_benches.Table] = {
         "tracker": {
             "resolution_px": STRIPE_SIZE_PX,
             "exposure_s": exposure_s,
-            "transmission": settings.GLASS,
+            "transmission": study_benches.GLASS,
         },
         "sky": {"faintest_v_mag": 3.0},
-        "monitor": {**settings.FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
+        "monitor": {**study_benches.FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
         "collimator": {"focal_length_mm": 350},
     }
-    rolling: settings.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
+    rolling: study_benches.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
     view = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s)
     light = []
     for extra in ({"tracker.detector": rolling}, {}):
         with TemporaryDirectory() as folder:
             path = Path(folder) / "bench.toml"
-            path.write_text(settings.bench_text({**tables, **extra}), encoding="utf-8")
+            path.write_text(study_benches.bench_text({**tables, **extra}), encoding="utf-8")
             file = read_bench_file(path)
             tracker = DisplayTracker(file)
             light.append(
@@ -237,7 +237,7 @@ def slew(rate_deg_s: float) -> Movement:
 class Compensation:
     """A bench's compensation: further keys of [monitor], and `motion` of [render]."""
 
-    monitor_keys: settings.Table
+    monitor_keys: study_benches.Table
     motion: str
 
 
@@ -274,21 +274,21 @@ class ScanningPanel(Closing):
     def __init__(
         self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0
     ) -> None:
-        held: settings.Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
-        tables: dict[str, settings.Table] = {
+        held: study_benches.Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
+        tables: dict[str, study_benches.Table] = {
             "tracker": {
                 "resolution_px": (800, 640),
                 "exposure_s": exposure_s,
-                "transmission": settings.GLASS,
+                "transmission": study_benches.GLASS,
             },
             "sky": {"faintest_v_mag": 6.0},
-            "monitor": {**settings.FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
+            "monitor": {**study_benches.FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
             "collimator": {"focal_length_mm": 350},
             "render": {"quantisation": "exact", "motion": WAYS[way].motion, "brightest_v_mag": 1.5},
         }
         self.way = way
         self.start_s = START_S
-        self.bench = settings.study_bench(path, tables)
+        self.bench = study_benches.study_bench(path, tables)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
         self.panel_scan = replace(
@@ -454,7 +454,7 @@ def _exposure_points(
     to_tracker = panel.optics.geometry.to_tracker
     camera = panel.bench.camera
     windows = list(
-        settings.lone_windows(
+        study_benches.lone_windows(
             paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION
         )
     )
@@ -474,7 +474,7 @@ def _exposure_points(
     )
     for index, (_, window) in enumerate(windows):
         off_px = np.subtract(
-            settings.centroid_px(shown, window), settings.centroid_px(true, window)
+            study_benches.centroid_px(shown, window), study_benches.centroid_px(true, window)
         )
         speed = speed_px_s[:, index]
         yield BeatPoint(
@@ -539,7 +539,9 @@ def draw_beat(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]
 
 @dataclass(frozen=True, slots=True)
 class ForetoldBeat:
-    """What a phase of the exposure does to a star, by `run.sync`; columns as BeatPoint's."""
+    """The error of a star that `run.sync` foretells for a phase of the exposure; its columns are
+    those of BeatPoint.
+    """
 
     refreshes: float
     lit: float
@@ -592,8 +594,8 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
     true = sky.exposed_e_per_s(movement)
     paths = sky.paths(movement)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    windows = settings.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
-    errors = [settings.star_error(shown, true, window) for _, window in windows]
+    windows = study_benches.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
+    errors = [study_benches.star_error(shown, true, window) for _, window in windows]
     flux_mag = np.array([error.flux_mag for error in errors])
     off_arcsec = (
         np.array([error.centroid_px for error in errors])

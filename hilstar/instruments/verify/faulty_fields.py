@@ -200,7 +200,9 @@ class FaultyFields:
         return slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
 
     def _stars_off_px(self, shot: _Shot) -> float | None:
-        """How far the stars of a wrong attitude are from where that has them: the median."""
+        """Median distance, px, of the stars shown with a wrong attitude from their places by that
+        attitude; None without a match.
+        """
         truth = shot.frame.rows
         x_px, y_px = self._twin.assumed_geometry.to_tracker(truth["x_px"], truth["y_px"])
         match = self._finder.match(shot.shown_e, x_px, y_px)

@@ -37,7 +37,7 @@ from hilstar.instruments.simulate.twin import Twin, TwinField, true_calibration
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.config import BenchConfig
-from hilstar.server.bench.moving import wide_bodies
+from hilstar.server.bench.moving_sky import wide_bodies
 from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.centroids import (
@@ -124,8 +124,12 @@ def _fits(seen: FloatArray, back: FloatArray) -> "list[_MotionFit]":
     """Every model that so many stars (n, 2) can determine, the smallest first."""
     parts = _parts(*seen.T)
     wanted = back.T.ravel()
-    fits = [_MotionFit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
-    return [fit for fit in fits if MIN_RESIDUALS * fit.unknowns <= len(wanted)]
+    fits = []
+    for model in MODELS:
+        fit = _MotionFit.of({name: parts[name] for name in model}, wanted)
+        if MIN_RESIDUALS * fit.unknowns <= len(wanted):
+            fits.append(fit)
+    return fits
 
 
 def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
@@ -133,17 +137,14 @@ def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
     ones = np.ones_like(x)
     none = np.zeros_like(x)
     r2 = x * x + y * y
-    pairs = {
+    columns = {
         ALIGNED: [(x, y), (-y, x), (ones, none), (none, ones)],
         TILT: [(x * y, y * y), (-x * x, -x * y)],
         LENS: [(x * r2, y * r2)],
         HIGHER: [(x * r2**2, y * r2**2)],
         DECENTRED: [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)],
     }
-    return {
-        name: np.column_stack([np.concatenate(pair) for pair in columns])
-        for name, columns in pairs.items()
-    }
+    return {name: np.column_stack(list(map(np.concatenate, columns[name]))) for name in columns}
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,19 +387,14 @@ class Comparison:
         stars_listed = len(seen.truth)
         seen = with_blends_as_one(seen, self.finder.psf)
         tally.summed += stars_listed - len(seen.truth)
-        windowed = [
-            self.finder.find(image_e, seen.x_px, seen.y_px)
-            for image_e in (seen.sky_e, seen.shown_e)
-        ]
-        images_e = (seen.sky_e, seen.shown_e)
+        windowed_sky = self.finder.find(seen.sky_e, seen.x_px, seen.y_px)
+        windowed_shown = self.finder.find(seen.shown_e, seen.x_px, seen.y_px)
         true_px = (seen.x_px, seen.y_px)
-        errors_by_kind = {
-            kind: [
-                self.finder.placed(of, image_e, true_px, kind)
-                for of, image_e in zip(windowed, images_e, strict=True)
-            ]
-            for kind in dict.fromkeys([*FAMILY, self.finder.centroider])
-        }
+        errors_by_kind = {}
+        for kind in dict.fromkeys([*FAMILY, self.finder.centroider]):
+            in_sky = self.finder.placed(windowed_sky, seen.sky_e, true_px, kind)
+            in_shown = self.finder.placed(windowed_shown, seen.shown_e, true_px, kind)
+            errors_by_kind[kind] = in_sky, in_shown
         sky, shown = errors_by_kind[self.finder.centroider]
         if seen.assumed_e is seen.shown_e:
             assumed = shown

@@ -302,11 +302,18 @@ class _Reader(LensFileReader):
             raise InputError("its field is in angles and in image heights; write one of them")
         return kinds[0] if kinds else "angle"
 
+    def _numbers(self, name: str) -> tuple[float, ...]:
+        """The numbers behind a name, none where it is not stated."""
+        line = self.system.get(name)
+        if line is None:
+            return ()
+        return tuple(line.numbers())
+
     def _fields(self) -> Iterator[FieldPoint]:
         kind = self._field_kind()
         scale = 1.0 if kind == "angle" else self.mm
         names = (*FIELD_LISTS[kind], "VUX", "VLX", "VUY", "VLY")
-        lists = {name: self.system[name].numbers() if name in self.system else () for name in names}
+        lists = {name: self._numbers(name) for name in names}
         x_name, y_name = FIELD_LISTS[kind]
         for number in range(max(1, len(lists[x_name]), len(lists[y_name]))):
             at = {name: nth(values, number) for name, values in lists.items()}

@@ -140,11 +140,10 @@ class Field:
         along = np.roll(self.hull_px, -1, axis=0) - self.hull_px
         off = places[:, None] - begin
         cross_px = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
-        outside = np.flatnonzero(
-            (cross_px < -ON_EDGE_PX * self._scale).any(axis=1)
-            if len(begin) > 2
-            else np.ones(len(places), bool)
-        )
+        if len(begin) > 2:
+            outside = np.flatnonzero((cross_px < -ON_EDGE_PX * self._scale).any(axis=1))
+        else:
+            outside = np.arange(len(places))  # a line or a point has no inside
         if len(outside):
             length2 = np.maximum((along * along).sum(axis=1), 1e-300)
             part = np.clip((off[outside] * along).sum(axis=2) / length2, 0, 1)
@@ -184,12 +183,12 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class _Stamps:
-    """What pixels get: `stamps` (R, side^2), whose coefficients are polynomials of a star's place
-    in its pixel.
+    """Stamps, images of the light of pixels, from which PSFs are mixed: `stamps` (R, side^2).
 
-    `parts` (squares, 6 K, R) are what basis images have of a stamp in each square of the pixel,
-    rows first, by `_terms`. `sums` (R,) are those of the stamps, and `light` (K, n) is what pixels
-    get of basis images at all tabulated places.
+    The coefficient of a stamp is a polynomial of a star's place within its pixel. `parts` (squares,
+    6 K, R) are the polynomials' coefficients for each basis image and each square of a pixel, in
+    the order of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light of pixels
+    by basis image at all tabulated places.
     """
 
     stamps: Float32Array
@@ -270,14 +269,13 @@ class GlassPsf(SampledPsf):
         y, x = np.indices((height, width))
         ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
         light = np.stack([np.bincount(ring, image.ravel()) for image in self.optics.basis])
-        left_out = np.abs(
-            1 - np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)
-        ).max(axis=0)
-        wide = np.flatnonzero(left_out > MAX_CUT)
-        last = min(int(wide[-1]) + 1 if len(wide) else 0, len(left_out) - 1)
-        side = (
-            2 * math.ceil((last + 0.5) / self.per_px + (0.5 if self.pixel_integrated else 0.0)) + 1
-        )
+        light_within = np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)
+        cut = np.abs(1 - light_within).max(axis=0)
+        too_much = np.flatnonzero(cut > MAX_CUT)
+        last_ring = min(int(too_much[-1]) + 1, len(cut) - 1) if len(too_much) else 0
+        # samples of which pixels are integrated have light from half a pixel around them
+        pixel_half_px = 0.5 if self.pixel_integrated else 0.0
+        side = 2 * math.ceil((last_ring + 0.5) / self.per_px + pixel_half_px) + 1
         if side > MAX_FOOTPRINT_PX:
             raise InputError(
                 f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what"
@@ -291,13 +289,15 @@ class GlassPsf(SampledPsf):
         return max(float(self._table.max()), float(self._centred().max()))
 
     def _centred(self) -> Float32Array:
-        """What pixels get of each PSF (F L, side^2) of a star in a pixel's middle."""
+        """The light (F L, side^2) of the pixels about a star in the middle of a pixel, by each of
+        the PSFs.
+        """
         weights = self.optics.weights.reshape(-1, len(self.optics.basis)).astype(np.float32)
         return self._parts(weights, *np.zeros((2, len(weights)))) @ self._stamps.stamps
 
     def _tabulated(self, steps: int) -> list[FloatArray]:
-        """What pixels of the footprint get of the basis' rows and columns: (steps + 1, side,
-        samples), by place in a pixel.
+        """The light that pixels of the footprint collect from the rows and the columns of basis
+        images, (steps + 1, side, samples) each, by the star's place within its pixel.
         """
         side = self.footprint_px
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
@@ -388,8 +388,8 @@ class GlassPsf(SampledPsf):
         return np.asarray(light.reshape(-1, len(optics.basis)), dtype=np.float32)
 
     def _parts(self, weights: Float32Array, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
-        """What stars at places (n,), by square, that have `weights` (n, K) of the basis images
-        have of each stamp (n, R).
+        """The coefficients (n, R) of the stamps for stars at places (n,), sorted by `_square`, with
+        `weights` (n, K) of the basis images.
         """
         square, *within = _square(x_px, y_px, self._squares)
         terms = _terms(*within).astype(np.float32)[:, :, None]
@@ -460,8 +460,8 @@ class GlassPsf(SampledPsf):
     def _drawn(
         self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
     ) -> tuple[Float32Array, Float32Array]:
-        """What pixels get of stars at places (n,), sorted by `_square`: (n, side^2), times
-        factors (n,).
+        """The light (n, side^2) of the pixels about stars at places (n,), sorted by `_square`, and
+        factors (n,) by which it is to be multiplied.
         """
         weights = self._mixed(x_px, y_px, shares)
         parts = self._parts(weights, x_px, y_px)
@@ -576,9 +576,8 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
     basis = glass.basis.astype(np.float64)
     optics = Focused(basis, weights, illumination, inside)
     if lateral_px.any() or len(glass.focuses_um) > 1:
-        optics = _rebased(
-            optics, lateral_px * glass.per_px, 1 if glass.pixel_integrated else glass.per_px
-        )
+        pixel_samples = 1 if glass.pixel_integrated else glass.per_px
+        optics = _rebased(optics, lateral_px * glass.per_px, pixel_samples)
     field = Field(glass.places_px)
     return GlassPsf(
         _middle(optics, field, mean_shares),
@@ -672,9 +671,8 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
         images.append(np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)))
     gaussians = np.stack(images)
     gaussians /= gaussians.sum(axis=1, keepdims=True)
-    basis, weights, _ = principal(
-        gaussians, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px
-    )
+    pixel_samples = 1 if psf.pixel_integrated else psf.per_px
+    basis, weights, _ = principal(gaussians, optics.basis.shape[1:], TOLERANCE, pixel_samples)
     return _of_images(psf, basis.astype(np.float64), weights)
 
 
@@ -700,10 +698,12 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
     flat = optics.weights.reshape(-1, len(optics.basis))
     moves = lateral.reshape(-1, 2)
     padded = np.pad(optics.basis, ((0, 0), (room, room), (room, room)))
-    unmoved = (np.tensordot(weight, padded, axes=1) for weight in flat)
     moved = []
-    for image, move in zip(unmoved, moves, strict=True):
-        moved.append(shift(image, move[::-1], order=5) if move.any() else image)
+    for weight, move in zip(flat, moves, strict=True):
+        image = np.tensordot(weight, padded, axes=1)
+        if move.any():
+            image = shift(image, move[::-1], order=5)
+        moved.append(image)
     images = np.stack(moved)
     images /= images.sum(axis=(1, 2), keepdims=True)
     basis, weights, _ = principal(
@@ -734,8 +734,8 @@ def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> FloatArray:
-    """What pixels centred `at_px` (n,) along an axis get of each of `size` samples: (n, size),
-    by `SampledPsf`'s spline.
+    """The light (n, size) that pixels centred at `at_px` (n,) along an axis collect from each of
+    `size` samples, by the spline of `SampledPsf`.
     """
     from scipy.interpolate import make_interp_spline
 

@@ -385,7 +385,7 @@ def add_once(statements: dict[str, LensLine], line: LensLine, where: str = "") -
 
 
 class Frame:
-    """The axes of the surface that a reader has come to, by those of the lens."""
+    """The axes of the surface that a reader of a lens file has come to, in the axes of the lens."""
 
     def __init__(self) -> None:
         self.turn: FloatArray = np.eye(3)

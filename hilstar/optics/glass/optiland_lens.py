@@ -154,7 +154,7 @@ def _mask(apertures: Sequence[Aperture]) -> Any:
     from optiland.physical_apertures.base import BaseAperture
 
     class Mask(BaseAperture):  # type: ignore[misc]
-        """What goes through every aperture of a surface."""
+        """All apertures of a surface as one: light passes that passes each of them."""
 
         @property
         def extent(self) -> tuple[float, float, float, float]:

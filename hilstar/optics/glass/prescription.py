@@ -142,7 +142,9 @@ def _read(path: Path) -> "_Lens":
 
 
 def _stated(path: Path, data: bytes) -> LensPrescription | None:
-    """What a file states; None for optiland's own, which are its to read."""
+    """The prescription in a .zmx or .seq file; None for optiland's own format, which optiland
+    reads.
+    """
     if path.suffix.lower() == ".zmx":
         return read_zemax(data)
     if path.suffix.lower() == ".seq":
@@ -262,10 +264,9 @@ class _LensRays:
         """Places (2, n), mm from the detector's middle, and direction cosines (3, n) of rays, by
         the image surface's axes.
         """
-        places, cosines = (
-            self._to_image.T @ np.stack([np.asarray(part) for part in parts])
-            for parts in ((rays.x, rays.y, rays.z - self._image_mm[2]), (rays.L, rays.M, rays.N))
-        )
+        from_plane = np.stack([rays.x, rays.y, rays.z - self._image_mm[2]])
+        places = self._to_image.T @ from_plane
+        cosines = self._to_image.T @ np.stack([rays.L, rays.M, rays.N])
         moved = self._to_image.T @ np.array([*self._image_mm[:2], 0.0])
         return places[:2] - moved[:2, None] - self.centre_mm[:, None], cosines
 
@@ -278,12 +279,9 @@ class _LensRays:
             fields[:, 0], fields[:, 1], none, none, um
         )
         tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
-        return (
-            tangents,
-            self.at_image(self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um))[
-                0
-            ].T,
-        )
+        rays = self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um)
+        places, _ = self.at_image(rays)
+        return tangents, places.T
 
     def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
         """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
@@ -294,10 +292,8 @@ class _LensRays:
         fields = places_mm / slope_mm
         for _ in range(CHIEF_ROUNDS):
             fields = np.clip(fields, -1.5, 1.5)
-            fields = (
-                fields
-                + (places_mm - camera.places_mm(self.chiefs(fields, self.primary_um)[0])) / slope_mm
-            )
+            tangents, _ = self.chiefs(fields, self.primary_um)
+            fields = fields + (places_mm - camera.places_mm(tangents)) / slope_mm
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
@@ -377,7 +373,7 @@ def _filled(rays: int) -> FloatArray:
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The area that neighbours of a grid span in (a, b)."""
+    """The determinant of the map from a grid's cells to (a, b): the area of each cell there."""
     (a_down, a_right), (b_down, b_right) = np.gradient(a), np.gradient(b)
     return np.asarray(a_right * b_down - a_down * b_right)
 
@@ -572,16 +568,16 @@ class _Chiefs:
         largest = float(np.hypot(*tangents.T).max())
         (u, v), places = tangents[known].T / largest, places[known] / largest
         r2 = u * u + v * v
-        radial = [np.concatenate([part * r2**power for part in (u, v)]) for power in range(4)]
-        sides = [
-            np.concatenate(part)
-            for part in ((2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v))
-        ]
-        coefficients = np.linalg.lstsq(
-            np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None
-        )[0].tolist()
-        focal, *bent = coefficients
+        # A column of equations for each coefficient: all places' x, then all places' y.
+        radial = [np.concatenate([u * r2**power, v * r2**power]) for power in range(4)]
+        p1_column = np.concatenate([2 * u * v, r2 + 2 * v * v])
+        p2_column = np.concatenate([r2 + 2 * u * u, 2 * u * v])
+        columns = np.stack([*radial, p1_column, p2_column], axis=1)
+        coefficients = np.linalg.lstsq(columns, places.T.ravel(), rcond=None)[0].tolist()
+        # of tangents relative to the largest: turned back to tangents
+        focal, *distortion = coefficients
         k1, k2, k3, p1, p2 = (
-            part / focal / largest**power for part, power in zip(bent, (2, 4, 6, 1, 1), strict=True)
+            part / focal / largest**power
+            for part, power in zip(distortion, (2, 4, 6, 1, 1), strict=True)
         )
         return cls(focal, Lens((k1, k2, k3), (p1, p2)))

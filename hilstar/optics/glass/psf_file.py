@@ -233,10 +233,9 @@ def _by_pixels(images: FloatArray, width: int) -> FloatArray:
     apart = max(1, round(width / PHASES))
     pixel_sums = images
     for axis in (1, 2):
-        summed = np.cumsum(
-            np.pad(pixel_sums, [(width, width - 1) if k == axis else (0, 0) for k in range(3)]),
-            axis=axis,
-        )
+        margins = [(0, 0), (0, 0), (0, 0)]
+        margins[axis] = (width, width - 1)
+        summed = np.cumsum(np.pad(pixel_sums, margins), axis=axis)
         last = np.arange(width, summed.shape[axis], apart)
         pixel_sums = summed.take(last, axis) - summed.take(last - width, axis)
     return np.asarray(pixel_sums.reshape(len(images), -1) * (apart / width) ** 2)
@@ -360,12 +359,10 @@ def write_glass(path: Path, glass: Glass) -> None:
     header["OVERSAMP"] = (glass.per_px, "samples a tracker pixel")
     header["PIXINT"] = (glass.pixel_integrated, "whether the pixel is integrated")
     header["RESIDUAL"] = (glass.residual, "max share of a PSF's light put elsewhere")
-    for key, value in zip(
-        LENS_KEYS,
-        () if glass.lens is None else (*glass.lens.radial, *glass.lens.tangential),
-        strict=False,
-    ):
-        header[key] = (value, "distortion, Brown-Conrady of tangents")
+    if glass.lens is not None:
+        coefficients = (*glass.lens.radial, *glass.lens.tangential)
+        for key, value in zip(LENS_KEYS, coefficients, strict=False):
+            header[key] = (value, "distortion, Brown-Conrady of tangents")
     header["CREATOR"] = f"hilstar {__version__}"
     for line in glass.history:
         header["HISTORY"] = line

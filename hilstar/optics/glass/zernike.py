@@ -113,7 +113,8 @@ def diffracted(pupil: Pupil, per_px: int) -> Stack:
         places.append((x_px, y_px, nm, focus_um))
         slope2 = (pupil.pixel_pitch_um * 1e-3 / pupil.focal_length_mm) ** 2 * (off_px @ off_px)
         lateral_px = pupil.lateral_per_nm * (nm - pupil.reference_nm) * off_px
-        facts.append(((1 + slope2) ** -2 if pupil.cos4 else 1.0, outside, *lateral_px))
+        illumination = (1 + slope2) ** -2 if pupil.cos4 else 1.0
+        facts.append((illumination, outside, *lateral_px))
     return Stack(np.array(images), np.array(places), np.array(facts), per_px)
 
 

@@ -55,8 +55,8 @@ class BodyLayer:
         self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
-        """The light before without what discs hide, and with the light of the discs, which ends
-        up farthest first.
+        """The light of the layers before, less what the discs of bodies hide, and the light of the
+        discs, the farthest first.
         """
         discs = self._near(view)
         if not discs:
@@ -158,9 +158,8 @@ class BodyLayer:
         reach_rad = self._reach_rad
         wide_rad = POINT_PX / self._px_per_rad
         if view.turns:
-            reach_rad += view.turn.speed_rad_s * (
-                view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
-            )
+            away_s = view.scan.whole_s / 2 if view.exposed else view.scan.longest_s
+            reach_rad += view.turn.speed_rad_s * away_s
         axis = view.icrs_to_image(self.canvas.camera)[2]
         discs = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
         wide_discs = []
@@ -261,7 +260,9 @@ class BodyLayer:
 
 
 def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | None:
-    """What the turn of a camera does to an image whose rows are lit one after the other."""
+    """The shear of a turning camera's image, whose rows are lit one after the other; None where all
+    are lit at once.
+    """
     if not scan.scanout_s:
         return None
     late_s = tuple(

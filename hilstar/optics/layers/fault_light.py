@@ -39,7 +39,7 @@ from hilstar.optics.layers.view import Canvas
 from hilstar.optics.psf import Psf
 from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import AddedLight, FrameLight, pack_sprites
-from hilstar.sky.catalog import star_names
+from hilstar.sky.named_stars import hip_named
 from hilstar.sky.stars import Stars
 
 TRACK_SEED = 2  # beside the number of an exposure
@@ -170,11 +170,11 @@ class FaultView:
                 raise InputError(f"file = {fault.file!r}: {advice}")
             else:
                 values = read_map(self._folder / fault.file)
+                # The fault states the light of the brightest pixel, else the map's own is meant.
                 if fault.electrons_per_s is not None or fault.electrons is not None:
                     values = values / values.max()
-                image = map_image(
-                    values, fault, camera, by.tracker if fault.frame == "tracker" else by.monitor
-                )
+                of_its_frame = by.tracker if fault.frame == "tracker" else by.monitor
+                image = map_image(values, fault, camera, of_its_frame)
             known = extended.LightMap(image, times=self.light_e_per_s(fault), bv_mag=fault.bv_mag)
         with self._lock:
             self._maps.pop(fault, None)
@@ -326,17 +326,18 @@ class FaultView:
         self, now: Sequence[Now], q_icrs_to_cam: FloatArray
     ) -> list[extended.ExtendedLight]:
         """The stray light of the faults that are on."""
-        found: list[extended.ExtendedLight] = []
+        surfaces: list[extended.ExtendedLight] = []
         for active in now:
             fault = active.fault
             if isinstance(fault, Glow):
-                found.append(self._glow(fault, active.share, q_icrs_to_cam))
+                surfaces.append(self._glow(fault, active.share, q_icrs_to_cam))
             elif isinstance(fault, Gradient | MeasuredMap):
                 light = self._map(fault)
-                found.append(
-                    light if active.share == 1 else replace(light, times=light.times * active.share)
-                )
-        return found
+                # the same object, by which the renderer recognises the same light
+                if active.share != 1:
+                    light = replace(light, times=light.times * active.share)
+                surfaces.append(light)
+        return surfaces
 
     def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.GlowLight:
         fixed = fault.tracker_px is not None or fault.screen_px is not None
@@ -402,10 +403,7 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     number = re.fullmatch(r"HIP (\d{1,9})", wanted)
     if number is not None:
         return np.flatnonzero(stars.hip == int(number[1]))
-    hip = next(
-        (hip for hip, names in star_names().items() if wanted in (names.name, names.designation)),
-        None,
-    )
+    hip = hip_named(wanted)
     if hip is not None:
         return np.flatnonzero(stars.hip == hip)
     identifier = stars.catalog.identifier_of(wanted)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import propagate, to_matrix
-from hilstar.optics.extended import DiscLight, LightMap
+from hilstar.optics.extended import DiscLight, ExtendedLight, LightMap
 from hilstar.optics.layers.fault_kinds import (
     AttitudeStep,
     Blank,
@@ -72,9 +72,9 @@ class FaultLayer:
                 q = propagate(q, turn_rad, 1.0)
                 step = propagate(step, turn_rad, 1.0)
         rate = view.rate_cam_rad_s
-        return replace(
-            view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate
-        )
+        if rate is not None:
+            rate = to_matrix(step) @ rate
+        return replace(view, q_icrs_to_cam=q, rate_cam_rad_s=rate)
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
         """The light before without the stars that faults take away, and with the light that they
@@ -140,18 +140,15 @@ def _without_discs(sprites: FrameLight, gone: dict[str, float]) -> FrameLight:
     """
     if not any(name in gone for name in sprites.discs):
         return sprites
-    lights = tuple(
-        (
-            replace(light, times=light.times * gone[light.name])
-            if isinstance(light, LightMap | DiscLight) and light.name in gone
-            else light
-        )
-        for light in sprites.extended
-    )
+    lights: list[ExtendedLight] = []
+    for light in sprites.extended:
+        if isinstance(light, LightMap | DiscLight) and light.name in gone:
+            light = replace(light, times=light.times * gone[light.name])
+        lights.append(light)
     discs = tuple(name for name in sprites.discs if gone.get(name, 1.0) > 0)
     return replace(
         sprites,
-        extended=lights,
+        extended=tuple(lights),
         discs=discs,
         over_white=tuple(n for n in sprites.over_white if n in discs),
     )

@@ -55,7 +55,7 @@ def sky_layers(
     layers: list[Layer] = [StarLayer(canvas, frequent, paths)]
     if sources.diffuse:
         # its libraries take 30 ms, which only a map needs
-        from hilstar.optics.layers.diffuse import DiffuseLayer
+        from hilstar.optics.layers.diffuse_layer import DiffuseLayer
 
         layers.append(DiffuseLayer(sources.diffuse, canvas))
     moving = sources.moving

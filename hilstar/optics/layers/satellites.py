@@ -161,20 +161,15 @@ class SatelliteLayer:
             rates,
         )
         white_e_per_s = self.canvas.white_in(view)
-        names = tuple(trail_light.along[0].name for trail_light in drawn)
+        lights = list(light.extended)
+        discs = list(light.discs)
+        over_white = list(light.over_white)
+        for trail_light in drawn:
+            name = trail_light.along[0].name
+            lights.extend(trail_light.lights)
+            discs.append(name)
+            if trail_light.brightest_e_per_s > white_e_per_s:
+                over_white.append(name)
         return replace(
-            light,
-            extended=(
-                *light.extended,
-                *(part for trail_light in drawn for part in trail_light.lights),
-            ),
-            discs=(*light.discs, *names),
-            over_white=(
-                *light.over_white,
-                *(
-                    trail_light.along[0].name
-                    for trail_light in drawn
-                    if trail_light.brightest_e_per_s > white_e_per_s
-                ),
-            ),
+            light, extended=tuple(lights), discs=tuple(discs), over_white=tuple(over_white)
         )

@@ -141,9 +141,13 @@ def designations(stars: Stars, sprites: FrameLight, which: IntArray) -> tuple[in
 def sprite_names(stars: Stars, sprites: FrameLight) -> list[int | str]:
     """The star of each sprite: its HIP number, or its name without one."""
     star_names = iter(stars.designations(sprites.star[sprites.star >= 0]))
-    return [
-        sprites.added[-1 - k].name if k < 0 else next(star_names) for k in sprites.star.tolist()
-    ]
+    names: list[int | str] = []
+    for star in sprites.star.tolist():
+        if star < 0:
+            names.append(sprites.added[-1 - star].name)
+        else:
+            names.append(next(star_names))
+    return names
 
 
 def sprite_truth(

@@ -88,9 +88,9 @@ class View:
     @property
     def turn(self) -> CameraTurn:
         """The attitude and the rate; at rest a rate of 0."""
-        return CameraTurn(
-            self.q_icrs_to_cam, STILL if self.rate_cam_rad_s is None else self.rate_cam_rad_s
-        )
+        if self.rate_cam_rad_s is None:
+            return CameraTurn(self.q_icrs_to_cam, STILL)
+        return CameraTurn(self.q_icrs_to_cam, self.rate_cam_rad_s)
 
     @property
     def motion(self) -> Motion:

@@ -20,7 +20,7 @@ from hilstar.basics.rotation import (
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import bench_camera
-from hilstar.server.bench.certificate import Certificate, CubeToBoresight
+from hilstar.server.bench.certificate_file import Certificate, CubeToBoresight
 
 HALF_OF_95 = 1.959964  # sigmas of a normal distribution
 SAME = 1e-12

@@ -218,7 +218,8 @@ def measured_cost(
     if best_ms > limit_ms * SURELY_IN_TIME:
         cheap_ms = frame_ms(CHEAP, TIMED_ROUND_S)
     else:
-        cheap_ms = best_ms * (table.cheap_ms / table.best_ms if table.best_ms else 1.0)
+        share = table.cheap_ms / table.best_ms if table.best_ms else 1.0
+        cheap_ms = best_ms * share
     cheap_ms, best_ms = (max(float(f"{ms:.3g}"), MIN_POSITIVE) for ms in (cheap_ms, best_ms))
     return FieldCost(
         cheap_ms,

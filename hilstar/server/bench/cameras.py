@@ -297,18 +297,11 @@ class FieldsOfView:
 
     def line(self) -> str:
         """ "screen 18.0 x 10.2 deg, tracker 10.9 deg, 0.89 tracker px a monitor px"."""
-        screen, tracker = (
-            [figure(side) for side in sides] for sides in (self.screen_deg, self.tracker_deg)
-        )
-        if tracker[0] == tracker[1]:
-            across = tracker[0]
-        else:
-            across = " x ".join(tracker)
+        screen = " x ".join(map(figure, self.screen_deg))
+        width, height = map(figure, self.tracker_deg)
+        tracker = width if width == height else f"{width} x {height}"
         pixel = figure(self.tracker_px_a_monitor_px)
-        return (
-            f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a"
-            " monitor px"
-        )
+        return f"screen {screen} deg, tracker {tracker} deg, {pixel} tracker px a monitor px"
 
     def keys(self) -> dict[str, Any]:
         """The fields of view as --json has them."""
@@ -373,7 +366,9 @@ def _share(of: Camera, within: Camera) -> float:
 
 
 class _Oddity(NamedTuple):
-    """What cannot be right, and by how many decades."""
+    """A length or ratio of a bench that cannot be right, in words, and by how many decades it is
+    off.
+    """
 
     text: str
     decades: float

@@ -91,8 +91,8 @@ def bench_catalogue(
     rows = np.flatnonzero(every.v_mag <= limit)
     if not len(rows):
         raise InputError(
-            f"no star of the catalogue is brighter than V = {limit:g}; write a larger --to or [sky]"
-            " faintest_v_mag"
+            f"no star of the catalogue is brighter than V = {limit:g}; write a larger --faintest or"
+            " [sky] faintest_v_mag"
         )
     rows = rows[np.argsort(every.v_mag[rows], kind="stable")]
     if epoch_jyear is None:
@@ -409,16 +409,15 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
     if ending == ".parquet":
         _write_parquet(path, catalogue)
     elif ending == ".csv":
-        formats = dict.fromkeys(("ra_deg", "dec_deg"), f".{DECIMALS}f")
-        formats |= {
-            n: ".6g"
-            for n, c in catalogue.columns.items()
-            if c.values.dtype.kind == "f" and n not in formats
-        }
-        texts = [
-            [format(v, formats.get(n, "")) for v in c.values.tolist()]
-            for n, c in catalogue.columns.items()
-        ]
+        texts = []
+        for name, column in catalogue.columns.items():
+            if name in ("ra_deg", "dec_deg"):
+                form = f".{DECIMALS}f"
+            elif column.values.dtype.kind == "f":
+                form = ".6g"
+            else:
+                form = ""
+            texts.append([format(value, form) for value in column.values.tolist()])
         # MK types such as "S5,1" have commas
         write_csv(path, list(catalogue.columns), zip(*texts, strict=True))
     elif ending == ".vot":

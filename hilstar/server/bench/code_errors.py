@@ -209,8 +209,8 @@ def _grid(psf: Psf, seen: Seen, path_px: float, number: int) -> PhaseGrid:
 
 
 def _grid_of(psf: Psf, seen: Seen, path_px: float, phases: Phases) -> PhaseGrid:
-    """Stars at phases, on paths of a length: as `frame_motion` draws them, in sprites at the
-    nodes of each path.
+    """A grid of stars at phases, each on a path of `path_px`: drawn as `frame_motion` draws paths,
+    as sprites at Gauss-Legendre nodes.
     """
     sigmas = path_px / np.mean(psf.width_px)
     nodes = nodes_of(node_counts(np.array([sigmas]), NODES_PER_SIGMA, 1, POINT_SIGMA))
@@ -301,15 +301,18 @@ class _Search:
 
     def run(self) -> None:
         """Look for the worst star, and end at the first that is over the limit."""
+        # Steps are coarsest for faint stars: they are tried first, over a few spans of brightness.
         faintest_first = range(len(self._stars.spans) - 1, -1, -1)
         for span in faintest_first[::COARSE]:
             if self._is_over(span, span):
                 return
+        # then every span about the worst
         worst = self._corners()
         for span in faintest_first:
             near = min(abs(span - corner.span) for corner in worst) <= ABOUT
             if near and (self._is_over(span, span) or self._is_over(span, span + 1)):
                 return
+        # then phases ever nearer to the worst
         for radius_px, spans in zip(NEARER_PX, NEARER_SPANS, strict=True):
             for corner in self._corners():
                 if self._is_over_near(corner, radius_px, spans):

@@ -142,11 +142,11 @@ class Colours:
         return len(self.matrix.channels) == 1
 
     def wanted(self, stars: Stars, which: IntArray | None = None) -> FloatArray:
-        """What the mixtures of stars are made for: shares of channels (n, channels), or means of a
-        star's photons (n, 4 + k).
+        """What the mixture of primaries of each star should have.
 
-        Those are wavelength, the cumulative spectra's products with the primaries', and where a
-        lens moves them. Bodies count by their B-V.
+        Shares of channels (n, channels); or of a mono tracker means over the star's photons (n, 4 +
+        k): wavelength, products of the cumulative spectrum with the primaries', and displacements
+        by the lens. Bodies are taken by their B-V.
         """
         which = np.arange(len(stars)) if which is None else which
         if stars.colours is not None:
@@ -171,8 +171,11 @@ class Colours:
         return np.asarray(means)
 
     def for_stars(self, catalog: Catalog) -> "Colours":
-        """The same with the place aside by which a catalogue's stars part by colour as their
-        lens parts them.
+        """The same colours with the common displacement (`Lateral.aside`) by which mixtures of
+        primaries come nearest, rms, to what a catalogue's stars want.
+
+        A lens parts stars by colour, and primaries cannot part them as far: what all stars have in
+        common is free, as a distortion is.
         """
         if self.lateral is None or not len(catalog):
             return self
@@ -212,7 +215,8 @@ class Colours:
         away = self.mean_nm - self.mean_nm.mean()
         gram = self._gram + MEAN_WEIGHT * np.outer(away, away)
         near = wanted[:, 1:MOVED] + MEAN_WEIGHT * (wanted[:, :1] - self.mean_nm.mean()) * away
-        if (lens := self.lateral) is not None:
+        lens = self.lateral
+        if lens is not None:
             gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
             near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
         mixtures = nearest_mixtures(gram, near, whole=True)
@@ -242,8 +246,8 @@ class Colours:
         return np.asarray((shares / self.of_white).max(axis=1))
 
     def shown(self, shares: FloatArray) -> FloatArray:
-        """What mixtures (n, 3) have of what is `wanted`: shares of channels (n, channels), or
-        the mean wavelength (n, 1).
+        """What mixtures of primaries (n, 3) have of what is `wanted`: shares of channels (n,
+        channels), or the mean wavelength (n, 1), nm.
         """
         return np.asarray(shares @ (self.mean_nm[:, None] if self.mono else self.by_primary.T))
 
@@ -253,7 +257,8 @@ class Colours:
 
         Before a lens of known lateral colour, px rms over the field.
         """
-        if (lens := self.lateral) is not None:
+        lens = self.lateral
+        if lens is not None:
             return np.asarray(
                 np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1)
             )
@@ -326,12 +331,11 @@ class Colours:
             return replace(sprites, primaries=light)
         # the same objects are the same light: it is moved once
         if not self._kept or self._kept[0] != sprites.extended:
-            by_primary_light = extended_by_share(sprites, stars, primaries, by_bv)
-            moved = zip(by_primary_light, self.places_px.tolist(), strict=True)
-            self._kept[:] = [
-                sprites.extended,
-                tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved),
-            ]
+            by_primary = extended_by_share(sprites, stars, primaries, by_bv)
+            moved = []
+            for lights, (x_px, y_px) in zip(by_primary, self.places_px.tolist(), strict=True):
+                moved.append(tuple(shifted(part, -x_px, -y_px) for part in lights))
+            self._kept[:] = [sprites.extended, tuple(moved)]
         return replace(sprites, primaries=light, lights=self._kept[1])
 
 

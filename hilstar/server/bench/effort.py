@@ -305,19 +305,19 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     """
     auto = render.quantisation == "auto"
     methods = _methods(render, light)
-    combinations = sorted(_combinations(render, light, methods), key=lambda one: one.ms)
-    best = [one for one in combinations if one.method == methods[-1]]
+    combinations = sorted(_combinations(render, light, methods), key=lambda choice: choice.ms)
+    most_accurate = [choice for choice in combinations if choice.method == methods[-1]]
     # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
-    if len(best) > 1:
+    if len(most_accurate) > 1:
         tested = combinations
     else:
-        tested = [one for one in combinations if one.method != methods[-1]]
+        tested = [choice for choice in combinations if choice.method != methods[-1]]
     stars = light.code_stars() if tested else None
-    for one in tested:
-        if stars is not None and _is_within(render, light, stars, one):
-            return Effort(render, light, one, by_cost=auto and one.method != CHEAP)
-    taken = next(one for one in best if _is_slight(render, one))
-    return Effort(render, light, taken, by_cost=auto)
+    for choice in tested:
+        if stars is not None and _is_within(render, light, stars, choice):
+            return Effort(render, light, choice, by_cost=auto and choice.method != CHEAP)
+    slight = next(choice for choice in most_accurate if _is_slight(render, choice))
+    return Effort(render, light, slight, by_cost=auto)
 
 
 def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
@@ -336,7 +336,9 @@ def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
 
 
 def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
-    """What codes cost where they are drawn, measured or by the file; None where neither says so."""
+    """The cost of choosing codes where they are drawn, as it was measured, or as `[render]
+    codes_ms` states it; None for neither.
+    """
     if light.measured is None and render.codes_ms is not None:
         return FieldCost(*render.codes_ms, "by [render] codes_ms")
     return light.measured
@@ -402,7 +404,9 @@ def _scale(render: RenderSettings, light: Light) -> float:
 
 
 def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> float:
-    """The time of a frame of an average field that is not its sprites' pixels and paths."""
+    """The time of an average field's frame, ms, less what its sprites' pixels and paths take: what
+    choosing the codes costs.
+    """
     scale = _scale(render, light)
     known = known_cost(render, light)
     whole_ms = light.cost(QUANTISERS[method], light.psf).a_star_ms * light.stars * scale
@@ -441,7 +445,7 @@ def code_part(effort: Effort) -> Choice:
 
 
 def _price(cost: FieldCost, light: Light) -> str:
-    """What `exact` takes of a refresh."""
+    """The time that `exact` takes of a refresh, in words."""
     best_ms, cheap_ms = (_two_digits(ms) for ms in (cost.best_ms, cost.cheap_ms))
     price_text = f"exact takes {best_ms} ms of {light.refresh_ms:.3g} (round {cheap_ms})"
     price_text += f" for an average field at 1 deg/s {cost.where}"

@@ -26,11 +26,11 @@ def effort_lines(bench: Bench) -> list[str]:
     saved_ms = sum(choice.saved_ms for choice in effort.choices)
     together = Choice("together", "", effort.error_mag, effort.error_px, 0.0, saved_ms)
     rows.append((together.part, _verdict(effort), *_errors(effort, together), _saved(together)))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD))]
-    lines = [
-        "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join(cells).rstrip())
     lines += [f"{choice.part}: {choice.note}" for choice in effort.choices if choice.note]
     for remedy in would_do(bench):
         lines.append(f"{_remedy_head(remedy)}: {_remedy_text(remedy)}")

@@ -288,13 +288,13 @@ class Bench:
         """
         from hilstar.optics.layers.satellites import SatelliteLayer  # no other frame needs it
 
-        found: list[Disc] = []
+        discs: list[Disc] = []
         for layer in reversed(self.layers):
             if isinstance(layer, SatelliteLayer):
-                found += layer.discs(self.seen(self.stars, view), view)
+                discs += layer.discs(self.seen(self.stars, view), view)
             elif isinstance(layer, BodyLayer):
-                found += layer.on_image(view)
-        return found
+                discs += layer.on_image(view)
+        return discs
 
     def draw_sprites(self, sprites: FrameLight | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
@@ -527,10 +527,8 @@ def named(found: list[int | str], count: int) -> str:
     """ "Moon, HIP 32349, 27989 and 3 more", or "none"."""
     if not found:
         return "none"
-    bodies, hips = (
-        [designation for designation in found if isinstance(designation, kind)]
-        for kind in (str, int)
-    )
+    bodies = [designation for designation in found if isinstance(designation, str)]
+    hips = [designation for designation in found if isinstance(designation, int)]
     shown = [*bodies, *hips][:count]
     if len(found) <= count:
         more = ""

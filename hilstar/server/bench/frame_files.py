@@ -25,7 +25,7 @@ from hilstar.basics.rotation import to_matrix, to_radec_roll_deg
 from hilstar.basics.version import __version__
 from hilstar.display.response import Codes
 from hilstar.optics.camera import Camera
-from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench, Frame
 
 GOOD_PX = 0.01
@@ -217,7 +217,8 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header["NSTARS"] = (len(frame.rows), "stars in view")
     header["CALNAME"] = (bench.calibration.name, "monitor calibration")
     header["CALSHA"] = bench.calibration.sha256
-    if number := certificate_number(bench.file):
+    number = certificate_number(bench.file)
+    if number:
         header["CERTIF"] = (number, "certificate of the bench")
     if len(frame.light) > 1:
         header.update({"CTYPE3": "CHANNEL", "CRPIX3": 1.0, "CRVAL3": 1.0, "CD3_3": 1.0})

@@ -60,7 +60,9 @@ class PsfErrors:
 
 
 def candidates(psf: SampledPsf) -> Iterator[tuple[str, Callable[[], Psf]]]:
-    """What makes a PSF in the place of one, by name, the least first, and itself at last."""
+    """PSFs that may stand for `psf`, the cheapest first and `psf` itself last: the name of each,
+    and a function that makes it.
+    """
     yield GAUSSIAN_PSF, lambda: GaussianPsf(psf.width_px)
     yield from psf.simpler()
     name = WHOLE if psf.by_colour else ONE_PSF
@@ -109,8 +111,8 @@ def first_within(
     found: Iterator[tuple[Psf, Choice]] | Iterator[tuple[Psf, Choice | None]],
     tolerance: tuple[float, float],
 ) -> tuple[Psf, Choice | None]:
-    """The first PSF whose own errors are within a tolerance, mag and px, or that is no choice;
-    the last where none is.
+    """The first PSF whose errors are within a tolerance, mag and px, or that is the bench's own
+    (without a Choice); the last one where none is.
     """
     last: tuple[Psf, Choice | None] | None = None
     for last in found:

@@ -15,7 +15,7 @@ from hilstar.display.calibration import BUILT_IN, read_toml
 from hilstar.display.geometry import load_notes
 from hilstar.display.identity import MonitorIdentity, differences
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.certificate import bench_certificate
+from hilstar.server.bench.certificate_file import bench_certificate
 
 WAYS = "add --force, or measure it again: hilstar certify --again"
 SHOWN_ANYWAY = "shown anyway (--force)"
@@ -34,7 +34,9 @@ class MeasuredOn:
 
     @property
     def lacks(self) -> str:
-        """What it does not say; "" where it says both."""
+        """What the file does not say of its origin, in words; "" where it names both monitor and
+        date.
+        """
         if self.built_in:
             return f'[monitor] calibration = "{self.name}" is built in'
         lacking = []
@@ -106,21 +108,25 @@ def check_monitor(
     days = file.config.monitor.calibration_valid_days
     origins = list(measured_on(file))
     faults = []
-    unknown = [one.lacks for one in origins if one.lacks]
+    unknown = [origin.lacks for origin in origins if origin.lacks]
     doubts = []
-    for one in origins:
-        if one.identity is not None and now is not None:
+    for origin in origins:
+        if origin.identity is not None and now is not None:
             doubts = [now.doubt]
-            if one.identity.brightness is not None and now.brightness is None:
+            if origin.identity.brightness is not None and now.brightness is None:
                 doubts.append("the monitor's own settings cannot be read now (DDC/CI)")
-            if changes := ", ".join(differences(one.identity, now)):
+            changes = ", ".join(differences(origin.identity, now))
+            if changes:
                 faults.append(
-                    f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}:"
-                    f" {changes}"
+                    f"{origin.name} was measured on {origin.identity.name()}, and this is"
+                    f" {now.name()}: {changes}"
                 )
-        if one.date is not None and (age := (today - one.date).days) > days:
+        if origin.date is None:
+            continue
+        age_days = (today - origin.date).days
+        if age_days > days:
             faults.append(
-                f"{one.name} was measured {age} days ago, on {one.date}: [monitor]"
+                f"{origin.name} was measured {age_days} days ago, on {origin.date}: [monitor]"
                 f" calibration_valid_days = {days:g}"
             )
     if now is None:

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 
 class Scene(NamedTuple):
-    """What a bench's light is planned for: how its stars are drawn, full scale with that, and
-    the light of both.
+    """What the light of a bench is planned with: the PSF and why it was chosen, the full scale that
+    it allows, and the stars' light.
     """
 
     psf: Psf
@@ -55,8 +55,8 @@ class Scene(NamedTuple):
 
 
 class Display(NamedTuple):
-    """What shows a bench's stars: its light, its geometry, its GL; how much of white each star
-    asks for; see `turning_of` and `path_of`.
+    """The display of a bench: calibration, camera, GL context and darkest pixel; the share of white
+    that each star asks for; `turning` and `path_px` as of `turning_of` and `path_of`.
     """
 
     calibration: Calibration

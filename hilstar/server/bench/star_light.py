@@ -83,7 +83,7 @@ def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
     """
     if not has_observer(config):
         return None
-    from hilstar.server.bench.moving import (
+    from hilstar.server.bench.moving_sky import (
         moving_sky,  # importing the ephemeris takes 50 ms, which only bodies and an observer need
     )
 
@@ -121,6 +121,7 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
         chosen = chosen.at_phase(sky_jd(config, None))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
+    # A moving sky has its observer's place and velocity; without one the bench file has them.
     if moving is not None:
         vectors = moving.stars_seen(vectors, catalog.parallax_mas)
     elif any(sky.observer_velocity_km_s):

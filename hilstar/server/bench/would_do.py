@@ -30,7 +30,7 @@ BITS = (10, 12, 14, 16)
 BRIGHTER_MAG = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # by which full scale comes down
 WIDER = (1.2, 1.4, 1.7, 2.0)  # times the sprite's sigma
 SHALLOWER_MAG = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # above the faintest star
-DIGITS = 3
+DIGITS = 3  # of a value that is proposed
 OVER_FRAMES = "temporal"
 MAX_PAIRS = 3  # the cheapest; more would not be read, and each takes half a second to find
 Value = float | bool | str | tuple[float, float]
@@ -67,11 +67,11 @@ class _Trial:
     changes: tuple[Change, ...] = ()
 
     def but(self, key: str, value: Value, **changed: Any) -> "_Trial":
-        """The same with one more change."""
+        """The trial with one more change."""
         return replace(self, changes=(*self.changes, Change(key, value)), **changed)
 
     def rendered(self, key: str, value: Value, **more: Value) -> "_Trial":
-        """The same with another value of a key of [render]."""
+        """The trial with another value of a key of [render]."""
         changed: dict[str, Value] = {key: value, **more}
         render = msgspec.structs.replace(self.render, **changed)
         return self.but(f"[render] {key}", value, render=render)
@@ -217,7 +217,7 @@ def would_do(bench: Bench) -> list[Remedy]:
 
 
 def _remedies(trials: _Trials, some: Sequence[_Trial | None]) -> list[Remedy]:
-    """What some trials come to, but those that there are none of."""
+    """The remedies of those trials that are not None, with the errors that each leaves."""
     remedies = []
     for trial in some:
         if trial is not None:

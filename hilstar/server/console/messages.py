@@ -21,7 +21,7 @@ import numpy as np
 from hilstar.server.answers.judge import TrackerFigures
 from hilstar.server.console import protocol
 
-FRAME = struct.Struct("<12qI")
+FRAME = struct.Struct("<9qI")
 PICTURE = struct.Struct("<3q4I4d")
 STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
 _HEAD = struct.Struct("<Q")
@@ -52,9 +52,6 @@ class FrameNumbers(NamedTuple):
     missed_before: int
     frames: int
     missed: int
-    stale: int
-    given_up: int
-    received: int
     refused: int
     flags: int
 

@@ -11,6 +11,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from hilstar.server.answers.judge import TrackerFigures
+from hilstar.server.console.page_figures import RunCounts
 
 # the WebSocket's subprotocols; the token follows the second
 SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."
@@ -45,11 +46,16 @@ class Hello(msgspec.Struct, kw_only=True):
 
 
 class SkyHealth(msgspec.Struct, frozen=True):
-    """Whether the sky is right, since when (UTC), and why not. Also the answer of `GET /health`."""
+    """Whether the sky is right, since when (UTC), and why not. Also the answer of `GET /health`.
+
+    `headline` says it in a few words. `late`: the sky itself is right, and its frames are missed.
+    """
 
     ok: bool
     since: str
     reasons: list[str]
+    headline: str = ""
+    late: bool = False
 
 
 class ShownAttitude(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,21 +86,6 @@ class ShownClock(msgspec.Struct, frozen=True, kw_only=True):
     drift_ppm: float | None
     synchronised: bool
     mode: str
-
-
-class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames and packets since the run began; `refused` by reason; `lost` as gaps of their
-    `sequence` show.
-    """
-
-    frames: int = 0
-    missed: int = 0
-    stale: int = 0
-    given_up: int = 0
-    received: int = 0
-    accepted: int = 0
-    lost: int = 0
-    refused: dict[str, int] = {}
 
 
 class Pacing(msgspec.Struct, frozen=True):

@@ -24,11 +24,12 @@ from hilstar.basics.rotation import to_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.version import __version__
 from hilstar.optics.sprites import brightest
-from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.console import messages, protocol
 from hilstar.server.console.listener import PageListener
 from hilstar.server.console.overlay import OverlayScene, colour_notes, overlay_of
+from hilstar.server.console.page_figures import counts_of
 from hilstar.server.console.page_process import Listeners, PageProcess
 from hilstar.server.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests
 from hilstar.server.pointing import POINTING
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
     from hilstar.server.live_answers import LiveAnswers
     from hilstar.server.pacer import Shown
     from hilstar.server.record.ledger import Ledger, LedgerSwitch
+    from hilstar.server.run_progress import Running
     from hilstar.server.screen.screen import Screen
-    from hilstar.server.serve import Running
 
 MIN_PICTURE_NS = NS_PER_S // 10
 MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
@@ -117,9 +118,6 @@ class FramePublisher:
                 shown.missed_before,
                 tally.frames,
                 tally.missed_frames,
-                tally.stale_frames,
-                tally.given_up_frames,
-                packets.received,
                 packets.refused,
                 flags,
             )
@@ -182,7 +180,6 @@ class WatchedRun:
             return messages.RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
         tally = running.loop.tally
         aids = running.loop.pacer.operator.aids
-        packets = running.packets
         screen = self._parts.screen
         faults = self._parts.faults
         newest = protocol.NewestFrame()
@@ -201,16 +198,7 @@ class WatchedRun:
             frame=newest,
             attitude=_attitude(shown),
             clock=_clock(running),
-            counts=protocol.RunCounts(
-                frames=tally.frames,
-                missed=tally.missed_frames,
-                stale=tally.stale_frames,
-                given_up=tally.given_up_frames,
-                received=packets.received,
-                accepted=packets.received - packets.refused,
-                lost=packets.lost,
-                refused={reason: count for reason, count in packets.refused_by.items() if count},
-            ),
+            counts=counts_of(running),
             operator=aids.states(),
             operator_text=aids.text,
             overlay=aids.overlay,

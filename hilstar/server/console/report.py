@@ -30,7 +30,7 @@ from hilstar.server.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.server.faults import read_recording
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import EventRecord, codes_ms_of, config_of, wrong_in_frame
-from hilstar.server.record.report import (
+from hilstar.server.record.run_figures import (
     COUNTS,
     METRICS,
     RunFigures,
@@ -55,6 +55,7 @@ CAUTION = (
     "Drawn by a bench that is not the run's own: a file that it names has changed since, or another"
     " version of hilstar wrote the ledger. Codes may differ from those shown."
 )
+NO_VALUES = "- / - / -"  # how a row of percentiles begins that the run has no values of
 BINS = 60
 HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
 MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relative to its values
@@ -257,7 +258,7 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
         return {
             "about": about,
             "verdict": verdict(summary, run.counted["late"]),
-            "summary": rows[:-3],
+            "summary": [row for row in rows[:-3] if not row[1].startswith(NO_VALUES)],
             "facts": rows[-3:],
             "bench_text": run.head.get("bench_text", ""),
             "duration_s": summary.duration_s,
@@ -280,6 +281,8 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
 def verdict(found: RunReport, late: int) -> dict[str, Any]:
     """Whether the sky was right throughout, in which share of the refresh periods it was, and
     why not in the others.
+
+    `late`: frames were missed, and nothing else was wrong: what was shown was the right sky.
     """
     counted = (
         (found.blank_frames, "without an attitude"),
@@ -296,11 +299,14 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
         for condition in found.wrong_sky.conditions
         if condition.seconds
     ]
+    due = found.frames + found.missed_frames  # refresh periods in which a frame was due
+    only_late = len(reasons) == 1 and found.missed_frames > 0
     if not reasons:
         headline = "Sky was right throughout"
+    elif only_late:
+        headline = f"{100 * found.missed_frames / due:.2g} % of frames missed"
     else:
         headline = "Sky was not right throughout"
-    due = found.frames + found.missed_frames  # refresh periods in which a frame was due
     percent = 100 * found.right_frames / max(due, 1)
     if percent > 99.9:
         digits = 3
@@ -310,7 +316,8 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
         digits = 1
     # rounded down: only all of them are 100 %
     share = f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
-    return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
+    told = {"ok": not reasons, "late": only_late, "headline": headline}
+    return told | {"share": share, "reasons": reasons}
 
 
 def _utc(run: RunFigures, host_ns: int) -> str | None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hilstar.server.answers.judge import TrackerFigures
     from hilstar.server.pacer import Shown
     from hilstar.server.record.ledger import LedgerSwitch
-    from hilstar.server.serve import Running
+    from hilstar.server.run_progress import Running
 
 LIVE_EACH_S = 0.5
 PLAIN_EACH_S = 10.0

@@ -2,7 +2,9 @@
 
 import json
 import math
+import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -12,6 +14,7 @@ import typer
 from msgspec import UNSET
 
 from hilstar.basics.errors import one_line
+from hilstar.basics.process.interrupts import finish_stderr
 
 if TYPE_CHECKING:
     from hilstar.attitude.clock.sender_clock import ClockSummary
@@ -30,6 +33,17 @@ INSTEAD: "dict[Reason, str]" = {
     "time": "let t_ns rise from packet to packet",
     "source": "stop one of the two senders",
 }
+STATE_WIDTH = 8
+STATE_STYLES = {
+    "ok": "green",
+    "none": "dim",
+    "check": "yellow",
+    "MISSING": "bold red",
+    "CHANGED": "bold red",
+}
+NAME_STYLE = "bold cyan"  # that of an option in --help
+BUSY_AFTER_S = 1.0  # a command that ends sooner shows no bar
+ERASED_WITHIN_S = 0.5
 CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
 
 
@@ -56,6 +70,28 @@ def print_found(as_json: bool, found: Any, lines: Iterable[str]) -> None:
     else:
         for line in lines:
             typer.echo(line)
+
+
+def print_states(lines: Iterable[str]) -> None:
+    """Lines that begin with a state and a name, 8 and 12 characters; in the colours of --help on a
+    terminal, without any elsewhere and with NO_COLOR.
+    """
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
+        for line in lines:
+            typer.echo(line)
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console()
+    for line in lines:
+        text = Text(line)
+        state = line[:STATE_WIDTH].strip()
+        if state:
+            text.stylize(STATE_STYLES.get(state, ""), 0, STATE_WIDTH)
+            name = line[STATE_WIDTH:].split(" ")[0]
+            text.stylize(NAME_STYLE, STATE_WIDTH, STATE_WIDTH + len(name))
+        console.print(text, soft_wrap=True)
 
 
 def _plain(value: Any) -> Any:
@@ -180,10 +216,15 @@ def clock_line(clock: "ClockSummary") -> str:
     return f"{CLOCK_WORDS[clock.mode]}: {known}{jumps}"
 
 
+def _shows_bars() -> bool:
+    """Whether stderr is a terminal that can erase a line."""
+    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+
+
 @contextmanager
 def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
     """A bar on a terminal's stderr, nothing elsewhere."""
-    if sys.stderr is None or not sys.stderr.isatty():
+    if not _shows_bars():
         yield lambda done: None
         return
     from rich.console import Console
@@ -202,9 +243,48 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
+    # What is printed meanwhile stays on stdout; redirected, it would come out on stderr.
+    with Progress(
+        *columns, console=console, transient=True, refresh_per_second=4, redirect_stdout=False
+    ) as bar:
         task = bar.add_task(what, total=None if math.isinf(total) else total)
         yield lambda done: bar.update(task, completed=done)
+    finish_stderr(ERASED_WITHIN_S)
+
+
+@contextmanager
+def busy(what: str, after_s: float = BUSY_AFTER_S) -> Iterator[None]:
+    """The time that a computation of unknown length takes, on a terminal's stderr once it has
+    taken `after_s`; nothing elsewhere.
+    """
+    if not _shows_bars():
+        yield
+        return
+    ended = threading.Event()
+    shower = threading.Thread(target=_show_busy, args=(what, after_s, ended), daemon=True)
+    shower.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        shower.join()
+        # stderr is written by a thread: what follows on stdout would come before its last erasure
+        finish_stderr(ERASED_WITHIN_S)
+
+
+def _show_busy(what: str, after_s: float, ended: threading.Event) -> None:
+    if ended.wait(after_s):
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn("line"), TextColumn("{task.description}"), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, refresh_per_second=4, redirect_stdout=False
+    ) as bar:
+        bar.add_task(what, total=None)
+        ended.wait()
 
 
 def fail(line: str, code: int) -> NoReturn:

@@ -3,7 +3,7 @@
     aravis_child.py list         print the cameras, as a JSON list
     aravis_child.py grab NAME    open a camera and print a line of JSON about it; then one for each
                                  line read: {"exposure_us": ..., "file": ...} for
-                                 for an image, {"set": {...}} for features
+                                 an image, {"set": {...}} for features
 
 NAME is a serial number, VENDOR-MODEL, an address or Aravis's own identifier; "" is the only camera.
 An image's bytes go to `file`, as the camera sent them. It imports nothing of hilstar, and needs
@@ -28,7 +28,7 @@ PATIENCE_US = 5_000_000  # beside the exposure
 
 
 def cameras() -> list[dict[str, str]]:
-    """What Aravis sees: identifier, vendor, model, serial number and address of each."""
+    """What Aravis sees: identifier, vendor, model, serial number, address and protocol of each."""
     Aravis.update_device_list()
     return [
         {
@@ -37,6 +37,7 @@ def cameras() -> list[dict[str, str]]:
             "model": Aravis.get_device_model(k),
             "serial": Aravis.get_device_serial_nbr(k),
             "address": Aravis.get_device_address(k),
+            "protocol": Aravis.get_device_protocol(k),
         }
         for k in range(Aravis.get_n_devices())
     ]
@@ -72,6 +73,11 @@ class Camera:
     def __init__(self, identifier: str) -> None:
         self.camera = Aravis.Camera.new(identifier)
         self.device = self.camera.get_device()
+        # The exposure is who asks's own, and so is the light of an image.
+        if self.camera.is_exposure_auto_available():
+            self.camera.set_exposure_time_auto(Aravis.Auto.OFF)
+        if self.camera.is_gain_auto_available():
+            self.camera.set_gain_auto(Aravis.Auto.OFF)
 
     def adjust(self, features: dict[str, Any]) -> None:
         """Set features by their names, the pixel format first."""
@@ -104,7 +110,6 @@ class Camera:
     def take(self, exposure_us: float, path: Path) -> dict[str, Any]:
         """Expose once after now, and write the image's bytes."""
         self.camera.set_exposure_time(exposure_us)
-        exposed_us = self.camera.get_exposure_time()
         payload = self.camera.get_payload()
         stream = self.camera.create_stream(None, None)
         for _ in range(BUFFERS):
@@ -114,12 +119,18 @@ class Camera:
             buffer, taken = self._complete(stream, exposure_us)
         finally:
             self.camera.stop_acquisition()
-        path.write_bytes(buffer.get_data())
+        pad_bytes, _ = buffer.get_image_padding()
+        if pad_bytes:
+            raise LookupError(
+                f"each line of its image ends with {pad_bytes} bytes of padding; set another Width"
+            )
+        path.write_bytes(buffer.get_image_data())
         return {
             "format": self.camera.get_pixel_format_as_string(),
             "width": buffer.get_image_width(),
             "height": buffer.get_image_height(),
-            "exposure_us": exposed_us,
+            "exposure_us": self.camera.get_exposure_time(),
+            "arrived_utc_ns": buffer.get_system_timestamp(),
             "incomplete": taken - 1,
         }
 

@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ import numpy.typing as npt
 
 from hilstar.basics.errors import InputError, MachineError, shortened
 from hilstar.basics.process.closing import Closing
-from hilstar.server.genicam.pixels import FORMAT, unpacked
+from hilstar.basics.units import NS_PER_US
+from hilstar.server.genicam.pixels import FORMAT, mosaic_of, unpacked
 
 PREFIX = "genicam:"
 # A virtual environment cannot import Debian's `gi`: the system's own Python can.
@@ -39,8 +41,8 @@ def has_aravis() -> bool:
 
 
 def list_cameras() -> list[dict[str, str]]:
-    """The cameras that Aravis sees: `id`, `vendor`, `model`, `serial`, `address`; none without
-    Aravis.
+    """The cameras that Aravis sees: `id`, `vendor`, `model`, `serial`, `address` and
+    `protocol`; none without Aravis.
     """
     try:
         listed = subprocess.run(
@@ -56,6 +58,22 @@ def list_cameras() -> list[dict[str, str]]:
         return []
     cameras: list[dict[str, str]] = json.loads(listed.stdout)
     return cameras
+
+
+@dataclass(frozen=True, slots=True)
+class CameraImage:
+    """An image (height, width) in DN, and what its camera says of it.
+
+    `begun_utc_ns` is when the exposure began by the host's clock: its first bytes came an exposure
+    later. `bayer` is the mosaic's pattern such as "RGGB", "" without one. `incomplete` images came
+    before it.
+    """
+
+    dn: npt.NDArray[np.uint16]
+    exposure_s: float
+    begun_utc_ns: int
+    bayer: str
+    incomplete: int
 
 
 class CameraError(MachineError):
@@ -120,8 +138,8 @@ class GenicamCamera(Closing):
         self._ask({"exposure_us": exposure_us, "file": str(self._file)})
         self._asked = exposure_us, time.monotonic() + GRAB_TIMEOUT_S + 8 * exposure_s
 
-    def image(self) -> npt.NDArray[np.uint16] | None:
-        """The image (height, width) that was asked for, DN; None while it has not come.
+    def image(self) -> CameraImage | None:
+        """The image that was asked for; None while it has not come.
 
         Raises MachineError where none comes, InputError for one that cannot be read or whose
         exposure is not what was asked for.
@@ -135,9 +153,15 @@ class GenicamCamera(Closing):
         self._asked = None
         self._check_exposure(exposure_us, answer["exposure_us"])
         data = self._file.read_bytes()
-        return unpacked(data, answer["format"], answer["width"], answer["height"])
+        return CameraImage(
+            dn=unpacked(data, answer["format"], answer["width"], answer["height"]),
+            exposure_s=answer["exposure_us"] / 1e6,
+            begun_utc_ns=answer["arrived_utc_ns"] - round(answer["exposure_us"] * NS_PER_US),
+            bayer=mosaic_of(answer["format"]),
+            incomplete=answer["incomplete"],
+        )
 
-    def grab(self, exposure_s: float) -> npt.NDArray[np.uint16]:
+    def grab(self, exposure_s: float) -> CameraImage:
         """One image. Raises MachineError, InputError."""
         self.begin(exposure_s)
         while (image := self.image()) is None:

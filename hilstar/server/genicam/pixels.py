@@ -10,7 +10,17 @@ import numpy.typing as npt
 from hilstar.basics.errors import InputError
 
 FORMAT = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG))(8|10|12|14|16)(Packed|p)?")
+BAYER = "Bayer"
+# The name has the first row alone; the second has the other two of R, G, G and B.
+MOSAICS = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}
 Dn = npt.NDArray[np.uint16]
+
+
+def mosaic_of(pixel_format: str) -> str:
+    """The colours of two rows of pixels from the top left, such as "RGGB"; "" for grey."""
+    if not pixel_format.startswith(BAYER):
+        return ""
+    return MOSAICS.get(pixel_format[len(BAYER) :][:2], "")
 
 
 def unpacked(data: bytes, pixel_format: str, width_px: int, height_px: int) -> Dn:
@@ -43,7 +53,10 @@ def unpacked(data: bytes, pixel_format: str, width_px: int, height_px: int) -> D
 
 def _from_threes(data: bytes, bits: int, count: int) -> npt.NDArray[np.unsignedinteger]:
     """GigE Vision: the upper 8 bits of two pixels, and the lower ones of both between them."""
-    triples = np.frombuffer(data[: len(data) // 3 * 3], np.uint8).reshape(-1, 3).astype(np.uint16)
+    padded = data + bytes(len(data) % 3 == 2)  # the last one of an odd count has two bytes
+    triples = (
+        np.frombuffer(padded[: len(padded) // 3 * 3], np.uint8).reshape(-1, 3).astype(np.uint16)
+    )
     low_bits = bits - 8
     mask = (1 << low_bits) - 1
     pairs = np.empty((len(triples), 2), np.uint16)

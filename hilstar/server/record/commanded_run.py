@@ -29,6 +29,16 @@ class CommandedRun:
     changed: int
     missed: int = 0
 
+    @property
+    def held(self) -> int:
+        """How many frames were held beyond their refresh period, for missed ones."""
+        return len(self.commanded.held_s)
+
+    @property
+    def missed_share(self) -> float:
+        """The missed refresh periods over all."""
+        return self.missed / (self.missed + len(self.commanded.t_s))
+
     def seconds(self, t_ns: IntArray) -> FloatArray:
         """Times (n,) of the sender's clock, ns, as the run's seconds."""
         return np.asarray((t_ns - self.zero_ns) / NS_PER_S)

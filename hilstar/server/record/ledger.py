@@ -44,7 +44,7 @@ from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import caught, stop_on_signal
 from hilstar.basics.wrong_sky import BEGINS, ENDS
-from hilstar.server.bench.certificate import certificate_number
+from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench
 from hilstar.server.record.ledger_records import (
     LOST,
@@ -636,12 +636,14 @@ class LedgerSwitch:
         self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None
     ) -> None:
         """Record a packet; see `attitude.receiver.Watch`."""
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.packet(host_ns, raw, sample, refusal)
 
     def frame(self, record: FrameRecord) -> None:
         """Record a frame."""
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.frame(record)
 
     def notice(self, notice: Notice) -> None:
@@ -652,22 +654,26 @@ class LedgerSwitch:
             self._wrong_sky[notice.kind] = event_record(notice)
         elif notice.kind in BEGINS:
             self._wrong_sky.pop(BEGINS[notice.kind], None)
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.notice(notice)
 
     def answer(self, record: AnswerRecord) -> None:
         """Record an answer of the tracker."""
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.answer(record)
 
     def lost(self, number: int) -> None:
         """Count packets that a gap of their `sequence` shows."""
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.lost(number)
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.pulse(what)
 
     def fault(self, record: FaultRecord) -> None:
@@ -680,14 +686,16 @@ class LedgerSwitch:
             self._faults_on[record.number] = record
         else:
             self._faults_on.pop(record.number, None)
-        if (ledger := self.current) is not None:
+        ledger = self.current
+        if ledger is not None:
             ledger.fault(record)
 
     def begin(self, make: Callable[[], Ledger]) -> Ledger:
         """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot
         be made.
         """
-        if (ledger := self.current) is None:
+        ledger = self.current
+        if ledger is None:
             ledger = make()
             ledger.standing = self._standing
             for record in self._standing():

@@ -18,7 +18,7 @@ from hilstar.basics.units import ERROR_OF_MEDIAN, NS_PER_MS
 from hilstar.display.identity import TABLE
 from hilstar.display.render.driver import sleep_in_waits
 from hilstar.display.render.presenter import window_context
-from hilstar.display.window.output_settings import findings
+from hilstar.display.window.output_settings import Finding, findings
 from hilstar.display.window.this_monitor import identity_here
 from hilstar.display.window.window import Window, WindowSettings
 from hilstar.server.bench.bench_file import BenchFile
@@ -29,7 +29,7 @@ from hilstar.server.bench.monitor import orientation_of
 from hilstar.server.screen.screen import DrawBudget, Screen
 
 GATE_FRAMES = 120
-REFRESH_TOLERANCE = 0.01
+REFRESH_TOLERANCE = 0.01  # of the period: 59.94 Hz passes for 60 Hz, 59 Hz does not
 DROPPED = 1.5  # periods
 MAX_DROPPED = 2  # among GATE_FRAMES: a desktop that is still busy with the new window
 BURSTS, BURST = 3, 8  # bursts of swaps, to find how many are queued
@@ -111,10 +111,10 @@ def _bench_on(
         screen.forced += found.told(log)
         bench.warm_up()
         pass_gate(screen, force)
-        bench.output.update({} if screen.output is None else screen.output.fields())
-        bench.output.update(
-            {TABLE: {} if found.now is None else found.now.known(), "forced": screen.forced}
-        )
+        if screen.output is not None:
+            bench.output.update(screen.output.fields())
+        bench.output[TABLE] = {} if found.now is None else found.now.known()
+        bench.output["forced"] = screen.forced
         yield screen
 
 
@@ -129,11 +129,8 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     for number in range(GATE_FRAMES + 1):
         screen.present(number)
         swaps_ns.append(screen.swap())
-    timing = timing_of(
-        np.diff(swaps_ns) / NS_PER_MS,
-        monitor,
-        0 if window.display is None else window.display.refresh_hz,
-    )
+    reported_hz = 0 if window.display is None else window.display.refresh_hz
+    timing = timing_of(np.diff(swaps_ns) / NS_PER_MS, monitor, reported_hz)
     timing = replace(timing, modes_hz=window.modes_hz)
     screen.keep_time(timing.period_ms, timing.paced_by_screen, swaps_ns[-1])
     if timing.paced_by_screen and window.gone is None:
@@ -166,12 +163,10 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
         changed += (
             "; switch dithering, colour transforms and antialiasing off in the display's driver"
         )
-    told = (
-        ()
-        if screen.output is None
-        else tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))
-    )
-    doubts = [finding.text for finding in told if not finding.refused]
+    output_findings: tuple[Finding, ...] = ()
+    if screen.output is not None:
+        output_findings = tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))
+    doubts = [finding.text for finding in output_findings if not finding.refused]
     if window.others:
         others = (
             f"the X screen has other displays, {', '.join(window.others)}: frames may be copied"
@@ -184,7 +179,7 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
         )
     for doubt in doubts:
         log.warning("%s", doubt)
-    wrong = [finding.text for finding in told if finding.refused]
+    wrong = [finding.text for finding in output_findings if finding.refused]
     for fault in (*wrong, *faults(window, monitor, timing), *[changed] * bool(changed)):
         if not force:
             raise MachineError(f"{fault}; or add --force")

@@ -132,7 +132,8 @@ class Disc:
     def of_rate(self, electrons_per_s: float) -> "Disc":
         """The same disc with this flux in all; black where nothing of it is lit."""
         whole_sr = self.law_integral_sr()
-        return replace(self, normal_e_per_s_sr=electrons_per_s / whole_sr if whole_sr > 0 else 0.0)
+        radiance_e_per_s_sr = electrons_per_s / whole_sr if whole_sr > 0 else 0.0
+        return replace(self, normal_e_per_s_sr=radiance_e_per_s_sr)
 
     def impact(self, directions: FloatArray) -> FloatArray:
         """How close rays along ICRS directions (n, 3) pass the centre, radii (n,); infinite for

@@ -122,8 +122,10 @@ def body_v_mag(
         mag = float(polyval(min(phase_deg, EARTH_CURVE_DEG), EARTH_TERMS))
     else:
         curves = {"Mercury": MERCURY, "Venus": VENUS, "Mars": MARS, "Jupiter": JUPITER}
-        crescent = name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG
-        mag = float(polyval(phase_deg, VENUS_CRESCENT if crescent else curves[name]))
+        terms = curves[name]
+        if name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG:
+            terms = VENUS_CRESCENT
+        mag = float(polyval(phase_deg, terms))
     return mag + 5 * float(np.log10(sun_au * distance_au))
 
 
@@ -181,9 +183,9 @@ def reflected(names: tuple[str, ...]) -> electrons.Library:
 
 def bodies_bv_mag(names: tuple[str, ...]) -> FloatArray:
     """B-V of bodies (n,), by the Sun's and their albedos."""
-    blue, visual = (
-        np.array([albedo(name, np.array([nm]))[0] for name in names]) for nm in (B_NM, V_NM)
-    )
+    bands_nm = np.array([B_NM, V_NM])
+    albedos = np.array([albedo(name, bands_nm) for name in names]).reshape(-1, 2)
+    blue, visual = albedos.T
     return np.asarray(SUN_BV_MAG + magnitude(blue / visual))
 
 

@@ -296,12 +296,12 @@ class MovingSky:
             directions[others] = aberrate(directions[others], velocity)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         step = self._step(moment)
-        found = []
+        discs = []
         for i in np.flatnonzero(near).tolist():
-            found.append(_moved(self._face(step, i), directions[i], float(now[i, 3])))
+            discs.append(_moved(self._face(step, i), directions[i], float(now[i, 3])))
         if self.air is not None:
-            found = _through(self.air, found, self._utc_ns + moment.since_ns)
-        return sorted(found, key=lambda disc: disc.distance_km)
+            discs = _through(self.air, discs, self._utc_ns + moment.since_ns)
+        return sorted(discs, key=lambda disc: disc.distance_km)
 
     def distances_km(
         self,
@@ -461,16 +461,11 @@ class MovingSky:
         sight = self._sight(moment)
         jyear = self._jyear(moment.since_ns / NS_PER_S)
         from_sun_km = sight.seen_km + sight.view.from_sun_km
-        v_mag = np.array(
-            [
-                (
-                    DARK_V_MAG
-                    if name == EARTH
-                    else body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
-                )
-                for row, name in zip(self._drawn, self.names, strict=True)
-            ]
-        )
+        v_mag = np.full(len(self.names), DARK_V_MAG)
+        for body, (row, name) in enumerate(zip(self._drawn, self.names, strict=True)):
+            # the Earth's light is that of its disc, below
+            if name != EARTH:
+                v_mag[body] = body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
         rates = self._bodies.v0_e_per_s * flux_ratio(v_mag)
         if self._earth is not None and not at_centre(sight.place_km):
             disc = self._earth_disc(sight)
@@ -522,8 +517,8 @@ class MovingSky:
 
 
 def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatArray | None:
-    """The observer's velocity (3,) by which directions of the start are aberrated; None where
-    that is not seen.
+    """The observer's velocity (3,), km/s, relative to that of the start, by which directions are
+    aberrated; None where that moves nothing.
     """
     change = now[-1, :3]
     if velocity_km_s is not None:

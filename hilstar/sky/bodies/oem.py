@@ -69,10 +69,7 @@ class OemOrbit:
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
         if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
-            spans = ", ".join(
-                " to ".join(_date(int(t)) for t in s.t_ns[[0, -1]]) + f" {s.scale}"
-                for s in self._segments[:5]
-            )
+            spans = ", ".join(_span(s) for s in self._segments[:5])
             raise InputError(
                 f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}"
             )
@@ -224,12 +221,13 @@ def _epoch_ns(text: str, where: str) -> int:
         if match is None:
             raise ValueError
         year, month, day, of_year, hour, minute, second = match.groups()
-        date = np.datetime64(f"{year}-{month}-{day}" if month else year, "D") + (
-            int(of_year or 1) - 1
-        )
+        # either month and day, or the day of the year
+        day_of_year = int(of_year or 1)
+        start = f"{year}-{month}-{day}" if month else year
+        date = np.datetime64(start, "D") + (day_of_year - 1)
         inside = (
             int(year) in YEARS
-            and int(of_year or 1) in DAYS_OF_YEAR
+            and day_of_year in DAYS_OF_YEAR
             and int(hour) < 24
             and int(minute) < 60
         )
@@ -257,3 +255,9 @@ def _time(scale: str, utc_ns: int) -> int:
 
 def _date(t_ns: int) -> str:
     return str(np.datetime64(t_ns, "ns").astype("datetime64[s]"))
+
+
+def _span(segment: Segment) -> str:
+    """The first and the last date of a segment, and their time scale."""
+    first, last = _date(int(segment.t_ns[0])), _date(int(segment.t_ns[-1]))
+    return f"{first} to {last} {segment.scale}"

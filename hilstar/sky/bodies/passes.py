@@ -151,8 +151,8 @@ class Pass:
         )
 
     def vectors_km(self, seconds: FloatArray) -> FloatArray:
-        """From the observer to where each (n, 3) sent what arrives then, each at its own of
-        `seconds` (n,).
+        """Vectors (n, 3), km, from the observer to the satellites, each at its own of `seconds`
+        (n,), light time included.
         """
         return _at(self.seen_km, seconds[:, None])
 
@@ -163,8 +163,10 @@ class Pass:
         return np.asarray(speed / distance)
 
     def rates_e_per_s(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        """Mean electron rates (k,) between two times: by their middle's place, and in closed
-        form what varies by itself.
+        """Mean electron rates (k,) between two times.
+
+        Distance, phase and shadow are those of the middle time; the satellite's own variation is
+        averaged in closed form.
         """
         middle_s = ((begin_s + end_s) / 2)[:, None]
         listed = self.index[which]
@@ -315,8 +317,8 @@ class Satellites:
         reach_km: float,
         now: Circumstances,
     ) -> FloatArray:
-        """The most that each of these (n,) can send while it moves by `reach_km`: outside the
-        shadow, and in a flash.
+        """Upper bounds (n,) of the electron rates of satellites while they move by up to
+        `reach_km`: outside the Earth's shadow, and in a flash.
         """
         range_km = np.maximum(range_km, OWN_KM)
         closest_km = np.maximum(range_km - reach_km, OWN_KM)
@@ -411,7 +413,7 @@ class _Watch:
     found: IntArray
 
     def covers(self, cone: Cone, utc_ns: int, observer_km: FloatArray) -> bool:
-        """Whether they are all that can be in this cone."""
+        """Whether the satellites that were looked up include all that can be in this cone."""
         seconds = (utc_ns - self.utc_ns) / NS_PER_S
         if abs(seconds) > WATCH_S or float(cone.axis @ self.cone.axis) < COS_WATCH:
             return False

@@ -135,23 +135,16 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
             by_number[number] = satellite
     if not by_number:
         raise InputError(f"{file}: no element set in it; {LIST_FORM}")
-    shared = Counter(satellite.name for satellite in by_number.values())
-    names = (
-        (
-            (
-                satellite.name
-                if shared[satellite.name] == 1
-                else f"{satellite.name} {satellite.number}"
-            )
-            if satellite.name
-            else f"NORAD {satellite.number}"
-        )
-        for satellite in by_number.values()
-    )
-    return [
-        Satellite(name, satellite.number, satellite.satrec)
-        for name, satellite in zip(names, by_number.values(), strict=True)
-    ]
+    satellites_of_name = Counter(satellite.name for satellite in by_number.values())
+    named: list[Satellite] = []
+    for number, satellite in by_number.items():
+        name = satellite.name
+        if not name:
+            name = f"NORAD {number}"
+        elif satellites_of_name[name] > 1:
+            name = f"{name} {number}"
+        named.append(Satellite(name, number, satellite.satrec))
+    return named
 
 
 def _satellites(text: str, file: str) -> "Iterator[Satellite]":

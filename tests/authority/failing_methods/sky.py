@@ -15,8 +15,8 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import LIGHT_M_S, magnitude
 from hilstar.instruments.simulate.simulator import Simulator
-from hilstar.instruments.study.settings import Table, bench_text, held_out_errors, study_optics
 from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.instruments.study.study_benches import Table, bench_text, held_out_errors, study_optics
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.sky.electrons import (
     TABLE_DEGREE,

@@ -186,6 +186,72 @@ def test_single_pixels_have_the_codes_of_that_attitude(live, run):
     assert live.text("#picture-badge").startswith("Held on this page")
 
 
+MIDDLE_LIT = """
+const canvas = document.getElementById("picture");
+const at = [canvas.width / 2, canvas.height / 2].map(Math.round);
+return canvas.getContext("2d").getImageData(...at, 1, 1).data.slice(0, 3).some((value) => value > 0);
+"""
+TURNED_RAD = 0.02  # 34 px: pixels are 40 times as large, so that an unfollowed star is out of sight
+
+
+def test_single_pixels_follow_their_star_until_a_person_moves_them(live, run):
+    run.stand_still()
+    time.sleep(1)  # until the pictures that were on their way have come
+    ActionChains(live).send_keys("0", "9").perform()
+    live.until("document.getElementById('picture-text').textContent.includes('follows')")
+    followed = live.text("#picture-text").partition("follows ")[2]
+    run.turned_rad = TURNED_RAD
+    first = frame_of(live)
+    time.sleep(1)
+    assert frame_of(live) > first and live.run(MIDDLE_LIT)
+    assert live.text("#picture-text").endswith(f"follows {followed}")
+    live.find("#picture").click()
+    ActionChains(live).send_keys(Keys.ARROW_RIGHT).perform()
+    live.until("!document.getElementById('picture-text').textContent.includes('follows')")
+    assert "4000" in live.text("#picture-text")
+    ActionChains(live).send_keys("0").perform()
+
+
+JUDGED_LATE = """
+Promise.all([import("/static/health.js"), import("/static/figures.js")]).then(([{ Health }, figures]) => {
+  const health = new Health({ check: () => {}, open: true, refusedWhy: "" }, () => {});
+  const said = { ok: false, late: true, headline: "84 % of frames missed in the last second", reasons: ["frames are missing"], since: "2026-11-22T19:00:00.000Z" };
+  health.hear({ utc: "2026-11-22T19:00:01.000Z", health: said, counts: {} });
+  const judged = health.judge();
+  figures.nameStars([[0, 0, 1, 32349, "\u03b1 CMa", 1]]);
+  const rows = {};
+  figures.writeFigures("run", { frame: { clipped: [32349, 7, "Mars"] }, ledger: null, counts: { accepted: 1200, received: 1300, missed: 2 } },
+    { set: (name, text, shade) => (rows[name] = [text, shade]) });
+  const tracker = { rms_arcsec: [1.25, -2, 3], availability: 0.914, rate_hz: 10, refused: { crc: 2 }, trouble: "" };
+  figures.writeFigures("tracker", { tracker }, { set: (name, text, shade) => (rows[name] = [text, shade]) });
+  done([judged.headline, judged.reasons, rows]);
+});
+"""
+
+
+def test_late_frames_are_no_wrong_sky_and_stars_have_the_pictures_names(live):
+    headline, reasons, rows = live.run_async(JUDGED_LATE)
+    assert headline == "84 % of frames missed in the last second"
+    assert "right sky" in reasons
+    assert rows["Clipped"] == ["3: \u03b1 CMa, HIP 7, Mars", "warn"]
+    assert rows["Ledger"] == ["not written", "warn"]
+    assert rows["Packets"] == ["1\u202f200 of 1\u202f300 accepted", ""]
+    assert rows["Missed"] == ["2", "warn"] and rows["Frames"] == ["\u2013", ""]
+    assert rows["Rms"][0].replace("\u00a0", " ") == "+1.3  \u22122.0  +3.0\u2033"
+    assert rows["Availability"][0].replace("\u00a0", " ") == "91.4 % at 10.0 Hz"
+    assert rows["Refused"] == ["2 crc", "warn"] and rows["Line"] == ["in order", ""]
+
+
+def test_on_a_phone_every_overlay_s_button_is_whole(live):
+    live.size(390, 844)
+    right = live.run(
+        "return Math.max(...[...document.querySelectorAll('#overlays button')].map((one) =>"
+        " one.getBoundingClientRect().right))"
+    )
+    assert 0 < right <= 390
+    assert live.text("#theme") == "Theme: auto"
+
+
 def assert_overlay(page: Browser, before: str, same: bool) -> None:
     """The page draws when the browser asks it to, soon after a key."""
     wait_for(lambda: (pixels(page, "overlay") == before) == same, f"the overlay as before: {same}")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -93,6 +94,59 @@ def test_images_give_what_centroids_give(session):
     assert found["centroids"]["false"] < 0.02 * found["centroids"]["given"]
     assert found["held_out"]["rms_arcsec"] < IMAGES_ARCSEC[0] * 2
     assert found["error"]["max_arcsec"] < IMAGES_ARCSEC[1]
+
+
+def grabbing(session, folder):
+    """A command that takes the session's images, as a camera before the patterns would."""
+    script = folder / "grab.py"
+    script.write_text(
+        "import pathlib, shutil, sys\n"
+        "output, pattern = map(pathlib.Path, sys.argv[1:])\n"
+        "assert pattern.stat().st_size\n"
+        f"taken, = pathlib.Path({str(session)!r}).glob(output.stem + '.*')\n"
+        "shutil.copy(taken, output)\n"
+    )
+    return f"{sys.executable} {script} {{output}} {{pattern}}"
+
+
+def test_images_that_are_taken_here_give_what_their_files_give(session, tmp_path):
+    plan = tmp_path / "plan"
+    shutil.copytree(session / "plan", plan)
+    words = ["calibrate", "geometric", session / "bench.toml", "--plan", plan, "--json"]
+    words += ["--tracker-is-ideal", "--dark", session / "dark.fits"]
+    grab = ("--grab", grabbing(session, tmp_path))
+    taken = run_hilstar_here(*words, "-o", tmp_path / "taken.toml", *grab)
+    assert taken.returncode == 0, taken.stderr
+    assert "frame_011: image 12 of 12" in taken.stderr
+    # in the order of their frames, which rounding follows
+    files = sorted(images_in(session), key=lambda path: path.stem)
+    given = run_hilstar_here(*words, "-o", tmp_path / "given.toml", *files)
+    figures = [json.loads(run.stdout) for run in (taken, given)]
+    for found in figures:
+        del found["written"]
+    assert figures[0] == figures[1]
+    again = run_hilstar_here(*words, "-o", tmp_path / "again.toml", *grab)
+    assert_refused(again, 2, "has images", "--overwrite")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "no image of the dots: give their files, or --grab"),
+        (("frame_001.png", "--grab", "genicam:"), "--grab takes the images"),
+        (("frame_001.png", "--exposure", "1"), "--exposure: is for --grab"),
+        (("--grab", "cp {pattern} {output}", "--exposure", "1"), "--grab has no {exposure_s}"),
+        (("--grab", "cp {pattern} {output}", "--feed", "3"), "not an endpoint"),
+        (("--grab", "false {pattern} {output}"), "ended with code 1"),
+    ],
+)
+def test_a_grab_that_does_not_fit_is_refused(session, tmp_path, words, says):
+    plan = tmp_path / "plan"
+    shutil.copytree(session / "plan", plan)
+    words = [str(session / word) if word.startswith("frame_") else word for word in words]
+    wanted = ("--plan", plan, "-o", tmp_path / "g.toml", "--tracker-is-ideal")
+    refused = run_hilstar_here("calibrate", "geometric", session / "bench.toml", *words, *wanted)
+    assert_refused(refused, 2, says)
 
 
 @pytest.mark.parametrize("kind", ["saturated", "no number", "small", "text", "twice"])

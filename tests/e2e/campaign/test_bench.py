@@ -221,7 +221,7 @@ def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_th
     )
     with answering(planted):
         result = run_hilstar_here(
-            *COMMAND, "--console", "127.0.0.1:0", "--frames", "tcp://127.0.0.1:0", cwd=tmp_path
+            *COMMAND, "--console", "127.0.0.1:0", "--feed", "tcp://127.0.0.1:0", cwd=tmp_path
         )
     assert result.returncode == 0, result.stderr
     assert (

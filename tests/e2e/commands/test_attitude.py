@@ -74,19 +74,19 @@ def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
     ]
     rows = [(1_700_000_000.0 + 10 * k, q) for k, q in enumerate(turns)]
     log = log_of(tmp_path, rows)
-    by_seconds, by_date = told(log, "--at", "15"), told(log, "--at", "2023-11-14T22:13:35")
+    by_seconds, by_date = told(log, "--time", "15"), told(log, "--time", "2023-11-14T22:13:35")
     assert by_seconds == by_date
     assert by_seconds["t_ns"] == 1_700_000_015 * 10**9
     expected = Rotation.from_euler("z", 3, degrees=True)
     found = Rotation.from_quat(by_seconds["q_icrs_to_cam"], scalar_first=True)
     assert (found * expected.inv()).magnitude() < 1e-12
     for wrong in ("21", "-1", "2023-11-14T22:13:41", "noon", "nan"):
-        assert_refused(run_hilstar_here("attitude", log, f"--at={wrong}"), 2, f"--at {wrong}")
+        assert_refused(run_hilstar_here("attitude", log, f"--time={wrong}"), 2, f"--time {wrong}")
 
 
 def test_a_log_of_boot_time_has_no_dates(tmp_path):
     log = log_of(tmp_path, [(5.0, [1.0, 0.0, 0.0, 0.0]), (6.0, [1.0, 0.0, 0.0, 0.0])])
-    result = run_hilstar_here("attitude", log, "--at", "2026-11-22T10:00:00.5")
+    result = run_hilstar_here("attitude", log, "--time", "2026-11-22T10:00:00.5")
     assert_refused(
         result, 2, "1 s long, and its times are no dates; write seconds after its first sample\n"
     )
@@ -121,6 +121,6 @@ def test_silence_and_wrong_uses_are_refused_in_one_line(tmp_path):
     assert_refused(
         run_hilstar_here("attitude", bench, "--wait", "0.2"), 2, "no attitude within 0.2 s"
     )
-    assert_refused(run_hilstar_here("attitude", bench, "--at", "3"), 2, "--at 3")
+    assert_refused(run_hilstar_here("attitude", bench, "--time", "3"), 2, "--time 3")
     bench.write_text(SMALL_BENCH + attitude_table(free_port(), "lockstep = true"))
     assert_refused(run_hilstar_here("attitude", bench), 2, "lockstep")

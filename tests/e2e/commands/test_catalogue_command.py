@@ -57,7 +57,7 @@ def test_every_format_has_the_same_stars(bench, tmp_path):
             bench,
             "-o",
             tmp_path / f"s.{ending}",
-            "--to",
+            "--faintest",
             "2",
             "--epoch",
             "2030",
@@ -91,7 +91,7 @@ def test_every_format_has_the_same_stars(bench, tmp_path):
     ("arguments", "said"),
     [
         (("-o", "s.txt"), "ends in .csv, .fits, .parquet, .vot"),
-        (("-o", "s.csv", "--to", "-5"), "no star of the catalogue is brighter than V = -5"),
+        (("-o", "s.csv", "--faintest", "-5"), "no star of the catalogue is brighter than V = -5"),
     ],
 )
 def test_bad_input_is_one_line(bench, tmp_path, monkeypatch, arguments, said):
@@ -106,7 +106,7 @@ def test_b_and_i_are_given_as_measured_beside_the_spectrum_s(bench, tmp_path):
     """`b_mag` is up to 4 mag from V + (B-V): its description says why, and both are given."""
     from astropy.io.votable import parse_single_table
 
-    done = run_hilstar_here("catalogue", bench, "-o", tmp_path / "s.vot", "--to", "6")
+    done = run_hilstar_here("catalogue", bench, "-o", tmp_path / "s.vot", "--faintest", "6")
     assert done.returncode == 0, done.stderr
     table = parse_single_table(tmp_path / "s.vot")
     rows, words = table.array, {field.name: field.description for field in table.fields}

@@ -300,7 +300,7 @@ def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(
         at = (small_bench_file, "--radec", "84.057,-1.2,0", "--json", "-o", folder / "image.fits")
         framed = run("frame", *at, "--codes", folder / "codes.png")
         image = fits.getdata(folder / "image.fits")
-        simulated = run("simulate", *at, "--noise", "none", "--rate", "0.1,0.2,0.3")
+        simulated = run("simulate", *at, "--noise", "none", "--slew", "0.1,0.2,0.3")
         for done in (framed, simulated):
             assert done.returncode == 0, done.stderr
             lines = [line for line in done.stderr.splitlines() if "star_sigma_ratio" not in line]

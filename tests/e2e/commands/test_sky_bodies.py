@@ -250,7 +250,7 @@ def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodi
     text = bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source")
     bodies_file.write_text(text + '[spacecraft]\norbit = "station.oem"\n')
     done = run_hilstar_here(
-        "attitude", folder / "station.aem", "--bench", bodies_file, "--at", "30"
+        "attitude", folder / "station.aem", "--bench", bodies_file, "--time", "30"
     )
     # how the tracker is mounted
     assert (done.returncode, done.stderr.count("\n")) == (0, 1), done.stderr

@@ -127,7 +127,7 @@ def test_a_turn_smears_stars_and_keeps_their_flux(tmp_path):
     options = {"bench": tmp_path / "bench.toml", "pointing": ("--radec", "84.057,-1.2,0")}
     still, _, truth = simulate(tmp_path / "a.fits", "--noise", "none", **options)
     turned, header, moved = simulate(
-        tmp_path / "b.fits", "--noise", "none", "--rate", "0,0.3,0", **options
+        tmp_path / "b.fits", "--noise", "none", "--slew", "0,0.3,0", **options
     )
     assert header["RATEY"] == pytest.approx(0.3)
     assert (turned > 0).sum() > 1.3 * (still > 0).sum()
@@ -186,7 +186,7 @@ def test_a_log_is_simulated_over_all_cores(tmp_path):
     [
         (["--radec", "1,2,3"], ["-o OUT.fits"]),
         (["-o", "x.fits"], ["--radec", "--quaternion"]),
-        (["--radec", "1,2,3", "-o", "x.fits", "--rate", "1"], ["--rate 1", "X,Y,Z"]),
+        (["--radec", "1,2,3", "-o", "x.fits", "--slew", "1"], ["--slew 1", "X,Y,Z"]),
         (["--radec", "1,2,3", "-o", "x.fits", "--noise", "some"], ["some"]),
         (["--radec", "1,2,3", "-o", "x.fits", "--seed", "-1"], ["seed"]),
         (["--log", "none.csv", "-o", "d"], ["none.csv"]),

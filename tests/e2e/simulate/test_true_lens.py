@@ -13,9 +13,12 @@ from astropy.io import fits
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_outputs, files_named_in
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.calibrate.geometric.calibration import calibrate_geometry, write_calibrated
 from hilstar.instruments.calibrate.geometric.dots import plan_dots
 from hilstar.instruments.calibrate.geometric.fit import Nominal
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
+    calibrate_geometry,
+    write_calibrated,
+)
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here

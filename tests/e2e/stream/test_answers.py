@@ -346,7 +346,7 @@ def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
             for thread in threads:
                 thread.start()
             found = run_hilstar_here(
-                "answers", tmp_path / "bench.toml", "--explain", "--seconds", "1"
+                "answers", tmp_path / "bench.toml", "--explain", "--duration", "1"
             ).stdout
             over.set()
             for thread in threads:

@@ -5,6 +5,7 @@ answers.
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import socket
 import sys
@@ -28,7 +29,7 @@ from hilstar.cli import fmu
 from hilstar.server.sender import Sender
 from tests.e2e.console.test_scpi import instrument, scpi_run
 from tests.support.benches import LIVE_BENCH, ORION_Q
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import run_hilstar, run_hilstar_here
 from tests.support.senders import free_port
 from tests.support.waiting import wait_for
 
@@ -81,6 +82,14 @@ def tracker(port: int) -> Iterator[np.ndarray]:
 
 def off_arcsec(q: np.ndarray, other: np.ndarray) -> float:
     return 2 * float(np.arccos(min(1.0, abs(q @ other)))) * ARCSEC_PER_RAD
+
+
+def test_as_json_it_is_where_it_sends_and_what_was_written(tmp_path):
+    text = LIVE_BENCH + '[attitude]\nsource = "udp"\nbind = "127.0.0.1:5561"\nstatus_hz = 10\n'
+    (tmp_path / "bench.toml").write_text(text)
+    done = run_hilstar("fmu", "bench.toml", "-o", "display.fmu", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"address": "127.0.0.1:5561", "written": ["display.fmu"]}
 
 
 def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):

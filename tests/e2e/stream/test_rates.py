@@ -23,7 +23,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.server.bench.build import load
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import EventRecord
-from hilstar.server.serve import Running
+from hilstar.server.run_progress import Running
 from tests.support.live_runs import serve_until
 from tests.support.pages import page_of
 from tests.support.senders import ORION, connected, free_port, packet, publisher

@@ -15,7 +15,8 @@ from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.server.bench.build import load
 from hilstar.server.loop import Limit
 from hilstar.server.pacer import Shown
-from hilstar.server.serve import Running, serve
+from hilstar.server.run_progress import Running
+from hilstar.server.serve import serve
 from tests.support.commands import run_hilstar_here
 from tests.support.live_runs import median_age_ns, serve_until
 from tests.support.senders import LYRA, ORION, free_port, packet, publisher, talking

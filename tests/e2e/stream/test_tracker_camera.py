@@ -16,9 +16,9 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT, TWIN, bench_text
 from tests.support.commands import HILSTAR
 from tests.support.forks import Started
-from tests.support.gige_client import GigEClient, own_address
+from tests.support.gige_client import GigEClient, opened, own_address
 from tests.support.senders import free_port
-from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
 
@@ -58,7 +58,7 @@ def display(tmp_path_factory):
     (folder / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{q}\n600,{q}\n")
     command = [*HILSTAR, "replay", folder / "bench.toml", folder / "log.csv", "--headless"]
     with Started(
-        [*map(str, command), "--frames", endpoint],
+        [*map(str, command), "--feed", endpoint],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     ) as process:
@@ -79,22 +79,6 @@ def ended(process):
     process.terminate()
     out, err = process.communicate(timeout=PATIENCE_S)
     return json.loads(out), err
-
-
-def opened(client: GigEClient) -> GigEClient:
-    """The client once the camera answers."""
-
-    def answers() -> bool:
-        client.socket.settimeout(0.5)
-        try:
-            client.describe()
-        except OSError:
-            return False
-        return True
-
-    wait_for(answers, "the camera answers")
-    client.socket.settimeout(PATIENCE_S)
-    return client
 
 
 def test_a_triggered_exposure_is_one_image_of_the_stars_that_are_lit(display):

@@ -65,7 +65,7 @@ def display(tmp_path_factory):
         "--headless",
     ]
     with Started(
-        [*command, "--frames", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*command, "--feed", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:
         yield folder / "bench.toml", endpoint
         process.terminate()
@@ -234,10 +234,10 @@ def test_what_is_wrong_gets_one_line(tmp_path, options, said):
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        (["0"], "write a number of frames, or an endpoint"),
-        (["5", "--frames", "6"], "--frames 5 and --frames 6"),
-        (["tcp://127.0.0.1:x"], "not an endpoint"),
-        (["tcp://*:5"], "non-loopback"),
+        (["--frames", "0"], "'--frames': 0 is not in the range x>=1"),
+        (["--feed", "tcp://127.0.0.1:x"], "not an endpoint"),
+        (["--frames", "tcp://127.0.0.1:x"], "not an endpoint"),
+        (["--feed", "tcp://*:5"], "non-loopback"),
     ],
 )
 def test_frames_that_cannot_be_counted_or_sent_get_one_line(tmp_path, asked, said):
@@ -245,7 +245,7 @@ def test_frames_that_cannot_be_counted_or_sent_get_one_line(tmp_path, asked, sai
         bench_text(TWIN, {"attitude": {"source": "udp", "bind": f"127.0.0.1:{free_port()}"}})
     )
     assert_refused(
-        run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--frames", *asked),
+        run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", *asked),
         2,
         said,
     )

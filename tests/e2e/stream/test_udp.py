@@ -22,9 +22,10 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import angle_between_rad, propagate
 from hilstar.server.bench.build import load
 from hilstar.server.pacer import Shown
+from hilstar.server.run_progress import Running
 from hilstar.server.send_log import BadCable, Faults, send, spin_samples
 from hilstar.server.sender import UdpSender
-from hilstar.server.serve import Outlet, Running
+from hilstar.server.serve import Outlet
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR, Started

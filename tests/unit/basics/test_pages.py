@@ -16,10 +16,13 @@ from hilstar.basics.pages import (
     details_of,
     escaped,
     figures_of,
+    key_table,
     key_words,
+    keyed_rows,
     measured,
     page_of,
     page_style,
+    side_by_side,
     table_of,
     within,
 )
@@ -117,6 +120,42 @@ def test_text_is_escaped_and_an_uncertainty_has_its_sign() -> None:
 )
 def test_a_key_reads_as_words_and_a_unit(key, words) -> None:
     assert key_words(key) == words
+
+
+def test_figures_by_key_have_their_error_and_unit_beside_them() -> None:
+    figures = {
+        "psf_sigma_px": 0.5529870059,
+        "psf_sigma_error_px": 0.0056648,
+        "flux_at_white_e_per_s": 3148199.07,
+        "noise": 3.64e-5,
+        "dots": 12208,
+        "resolution_px": [1920, 1080],
+        "q_cam_to_mon": (1.0, 0.0, 2e-05, 0.0),
+        "error_mag": 0.25,  # of nothing that is named
+        "stable": "yes",
+        "identity": {},
+        "geometry": None,
+    }
+    assert keyed_rows(figures) == [
+        ("PSF sigma", f"0.5530 {PLUS_MINUS} 0.0057 px"),
+        ("flux at white", "3\u202f148\u202f000 e-/s"),
+        ("noise", "3.6\N{MIDDLE DOT}10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT FIVE}"),
+        ("dots", "12\u202f208"),
+        ("resolution", "1920 \N{MULTIPLICATION SIGN} 1080 px"),
+        (
+            "quaternion cam to mon",
+            "1, 0, 2\N{MIDDLE DOT}10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT FIVE}, 0",
+        ),
+        ("error", "0.25 mag"),
+        ("stable", "yes"),
+    ]
+    assert key_table([("a", "<b>")]).count('<th scope="row">a</th><td>&lt;b&gt;</td>') == 1
+
+
+def test_cards_without_pictures_stand_side_by_side() -> None:
+    pair = side_by_side([Card("Bias"), Card("Clock")])
+    assert pair.startswith('<div class="pair"><section class="card">')
+    assert pair.count("<h2>") == 2
 
 
 def test_figures_have_their_state() -> None:

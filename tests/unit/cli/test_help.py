@@ -9,8 +9,10 @@ import pytest
 from typer import Typer
 
 import hilstar
+from hilstar.basics.errors import InputError
 from hilstar.cli.app import application, run
 from tests.support.benches import ROOT
+from tests.support.commands import assert_refused, run_hilstar_here
 
 
 def lines_of(group: Typer) -> Iterator[list[str]]:
@@ -39,6 +41,35 @@ def test_help_is_there(words, flag, capsys):
     usage = next(line for line in capsys.readouterr().out.splitlines() if "Usage:" in line)
     typed = usage.partition(" [OPTIONS]")[0].split()
     assert typed[len(typed) - len(words) :] == words
+
+
+@pytest.mark.parametrize("words", LINES, ids=" ".join)
+def test_an_option_says_what_its_value_is(words, capsys):
+    """Not of which type it is; a limit that nobody meets is no help either."""
+    assert not run([*words, "--help"])
+    shown = capsys.readouterr().out
+    options = shown.partition("─ Options ─")[2]
+    for word in ("range>", "<int", "<float", "<str", "<path", "INTEGER", "FLOAT", "9223372"):
+        assert word not in options
+
+
+def test_a_seed_that_no_file_can_hold_is_refused():
+    with pytest.raises(InputError, match=f"--seed {2**63}: write 0 to {2**63 - 1}"):
+        run(["simulate", "bench.toml", "--radec", "0,0,0", "--seed", str(2**63)])
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["frame"], ["calibrate"], ["calibrate", "dots"]], ids=" ".join
+)
+def test_help_of_a_command_is_what_its_option_prints(words, capsys):
+    assert not run([*words, "--help"])
+    by_option = capsys.readouterr().out
+    assert not run(["help", *words])
+    assert capsys.readouterr().out == by_option
+
+
+def test_help_of_no_command_says_which_was_meant(tmp_path):
+    assert_refused(run_hilstar_here("help", "fram", cwd=tmp_path), 2, "did you mean frame?")
 
 
 def test_the_version_is_the_package_s(capsys):

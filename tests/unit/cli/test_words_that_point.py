@@ -17,7 +17,7 @@ DEMO = resource_path("configs", "demo.toml")
 TEXT_OUTPUTS = (
     ["frame", str(DEMO), "--radec", "84.057,-1.2,0", "--truth", "-"],
     ["calibrate", "plan", "-o", "-"],
-    ["catalogue", str(DEMO), "--to", "2", "-o", "-"],
+    ["catalogue", str(DEMO), "--faintest", "2", "-o", "-"],
 )
 OTHER_OUTPUTS = (
     ["frame", str(DEMO), "--radec", "84,-1,0", "-o", "-"],

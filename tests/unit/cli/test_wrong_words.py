@@ -40,8 +40,8 @@ MEANT = "84.057,-1.2,0, with commas and without spaces"
             "with commas and without spaces",
         ),
         (
-            ["simulate", BENCH, "--radec", "1,2,3", "--rate", "0", "1", "0", "-o", "o.fits"],
-            "write --rate 0,1,0",
+            ["simulate", BENCH, "--radec", "1,2,3", "--slew", "0", "1", "0", "-o", "o.fits"],
+            "write --slew 0,1,0",
         ),
     ],
     ids=lambda value: " ".join(value)[-40:] if isinstance(value, list) else None,

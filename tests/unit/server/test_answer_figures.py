@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord
-from hilstar.server.record.report import figures_of, summarise
+from hilstar.server.record.run_figures import figures_of, summarise
 from tests.support.commands import run_hilstar_here
 from tests.support.planted_run import NS_PER_S, write_ledger
 

@@ -13,6 +13,7 @@ from hilstar.basics.errors import InputError
 from hilstar.server.bench.config import parse_config
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, beat, beat_line, beat_of, seen_at
 from tests.support.benches import bench_text
+from tests.support.claims import holds
 
 STEPS = 40_000  # of the simulated exposures: a row's edge falls within 1 of them, at both ends
 CASES = {
@@ -69,6 +70,8 @@ def test_of_rows_that_stay_lit_the_largest_error_is_a_closed_form(refreshes):
     """f (1 - f) / 2 of a refresh's path over n + f; and no light is lost."""
     part = refreshes % 1
     found = beat(Exposures(60.0, refreshes / 60))
+    if refreshes == 6.3:
+        holds("beat-of-6.3", found.worst_arcsec_per_deg_s)
     assert found.worst_arcsec_per_deg_s == pytest.approx(
         part * (1 - part) / 2 / refreshes * 60.0, rel=1e-6
     )
@@ -80,6 +83,7 @@ def test_whole_refreshes_cure_the_light_of_a_panel_that_flashes_and_not_its_plac
     for whole in (1, 6, 100):
         found = beat(Exposures(60.0, whole / 60, lit_s=1 / 240))
         assert found.worst_mag < 1e-6
+        holds("flash-of-a-quarter", found.worst_arcsec_per_deg_s)
         assert found.worst_arcsec_per_deg_s == pytest.approx(
             0.75 / 2 / 60 * ARCSEC_PER_DEG, rel=1e-3
         )

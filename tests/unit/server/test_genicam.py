@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import contextlib
-import ipaddress
 import json
-import threading
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.basics.errors import InputError, MachineError
-from hilstar.basics.notices import Notices
+from hilstar.instruments.calibrate.first_light.image_sources import GrabCamera
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.genicam import camera as cameras
 from hilstar.server.genicam.camera import (
+    CameraError,
     GenicamCamera,
     chosen_format,
     has_aravis,
     list_cameras,
 )
-from hilstar.server.genicam.pixels import unpacked
+from hilstar.server.genicam.pixels import mosaic_of, unpacked
 from hilstar.server.gige.camera import GigECamera
-from hilstar.server.gige.registers import CameraIdentity, CameraSettings
+from hilstar.server.gige.registers import CameraSettings
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar, run_hilstar_here
+from tests.support.gige_cameras import fake_camera, running_camera
 from tests.support.gige_client import own_address
 
 needs_aravis = pytest.mark.skipif(
@@ -53,12 +52,62 @@ def test_a_camera_of_colour_images_alone_is_refused():
         chosen_format(["RGB8"], 12)
 
 
-def test_bits_in_a_row_are_pixels_lowest_bit_first():
-    # PFNC's figure of Mono12p: three bytes, the middle one shared by its halves.
-    data = bytes([0xBC, 0x3A, 0x12])
-    np.testing.assert_array_equal(unpacked(data, "Mono12p", 2, 1), [[0xABC, 0x123]])
-    data = bytes([0xFF, 0x03, 0x00, 0x00, 0x40])  # 1023, 0, 0, 256 in ten bits each
-    np.testing.assert_array_equal(unpacked(data, "Mono10p", 4, 1), [[0x3FF, 0, 0, 0x100]])
+# By hand from the figures of the GenICam PFNC, and for names in "Packed" from GigE Vision's: pixel
+# 0's bits are written a, pixel 1's b, the lowest first.
+VECTORS = {
+    "Mono8": ("01 FF", [0x01, 0xFF]),
+    "Mono10": ("FF 03 34 02", [0x3FF, 0x234]),
+    "Mono12": ("BC 0A 23 01", [0xABC, 0x123]),
+    "Mono14": ("FF 3F 01 20", [0x3FFF, 0x2001]),
+    "Mono16": ("CD AB 34 12", [0xABCD, 0x1234]),
+    # ten bits each without gaps, lowest first: 1023, 0, 0, 256
+    "Mono10p": ("FF 03 00 00 40", [0x3FF, 0, 0, 0x100]),
+    # byte 1 is shared: a's upper four bits below, b's lower four above
+    "Mono12p": ("BC 3A 12", [0xABC, 0x123]),
+    # upper eight bits of a, lower ones of both (a's in bits 0 and 1, b's in 4 and 5), upper of b
+    "Mono10Packed": ("AA 31 48", [0xAA << 2 | 0b01, 0x48 << 2 | 0b11]),
+    "Mono12Packed": ("AB 3C 12", [0xABC, 0x123]),
+    "BayerRG8": ("01 FF", [0x01, 0xFF]),
+    "BayerRG12": ("BC 0A 23 01", [0xABC, 0x123]),
+    "BayerGB12p": ("BC 3A 12", [0xABC, 0x123]),
+    "BayerBG12Packed": ("AB 3C 12", [0xABC, 0x123]),
+    "BayerGR10p": ("FF 03 00 00 40", [0x3FF, 0, 0, 0x100]),
+}
+
+
+@pytest.mark.parametrize("form", VECTORS)
+def test_bytes_are_pixels_as_the_standard_has_them(form):
+    data, pixels = VECTORS[form]
+    image = unpacked(bytes.fromhex(data), form, len(pixels), 1)
+    np.testing.assert_array_equal(image, [pixels])
+
+
+@pytest.mark.parametrize("form", ["Mono12Packed", "Mono12p", "Mono10p", "Mono10Packed"])
+def test_a_packed_image_of_an_odd_count_ends_within_a_byte_or_a_triple(form):
+    # three pixels, the last one full: its bits are in its own bytes, with or without the pair's
+    bits = int(form[4:6])
+    full = (1 << bits) - 1
+    count = 3 * bits
+    if form.endswith("p"):
+        data = (full << 2 * bits).to_bytes(-(-count // 8), "little")
+    else:
+        data = bytes([0, 0, 0, 0xFF, full & (1 << (bits - 8)) - 1])
+    np.testing.assert_array_equal(unpacked(data, form, 3, 1), [[0, 0, full]])
+    np.testing.assert_array_equal(unpacked(data + b"\0", form, 3, 1), [[0, 0, full]])
+
+
+@pytest.mark.parametrize(
+    ("form", "pattern"),
+    [
+        ("BayerRG8", "RGGB"),
+        ("BayerGR12p", "GRBG"),
+        ("BayerGB10Packed", "GBRG"),
+        ("BayerBG16", "BGGR"),
+        ("Mono12", ""),
+    ],
+)
+def test_a_mosaic_is_told_by_its_formats_name(form, pattern):
+    assert mosaic_of(form) == pattern
 
 
 @pytest.mark.parametrize("form", ["Mono8", "Mono12", "Mono12Packed", "Mono10p"])
@@ -85,29 +134,6 @@ def test_without_aravis_it_says_what_to_install(monkeypatch):
         GenicamCamera("")
 
 
-@contextlib.contextmanager
-def running_camera():
-    """The virtual camera, whose images count up."""
-    address, stop = own_address(), threading.Event()
-    identity = CameraIdentity(ipaddress.IPv4Address(address), "virtual tracker", "1", address[-12:])
-    settings = CameraSettings(64, 48, 12, 0.01, 50.0)
-
-    def feed() -> None:
-        k = 0
-        while not stop.wait(0.02):
-            k += 1
-            camera.take(np.full((48, 64), k % 4096, np.uint16), time.monotonic_ns())
-
-    with GigECamera(identity, settings, AllowedSenders(), Notices()) as camera:
-        thread = threading.Thread(target=feed)
-        thread.start()
-        try:
-            yield address
-        finally:
-            stop.set()
-            thread.join()
-
-
 @needs_aravis
 def test_a_camera_is_listed_set_and_read_in_every_format_it_has():
     with running_camera() as address:
@@ -117,11 +143,51 @@ def test_a_camera_is_listed_set_and_read_in_every_format_it_has():
             newest = 0
             for form in camera.about["formats"]:
                 camera.set({"PixelFormat": form})
-                image = camera.grab(0.01)
+                image = camera.grab(0.01).dn
                 assert image.shape == (48, 64) and image.min() == image.max()
                 if form != "Mono8":
                     assert image[0, 0] > newest
                     newest = int(image[0, 0])
+
+
+@needs_aravis
+def test_an_image_has_the_time_at_which_its_exposure_began():
+    with running_camera() as address, GenicamCamera(address) as camera:
+        before_ns = time.time_ns()
+        image = camera.grab(0.25)
+        after_ns = time.time_ns()
+    assert image.exposure_s == 0.25 and image.incomplete == 0 and image.bayer == ""
+    # The virtual camera of this test exposes nothing: its image comes at once.
+    assert before_ns <= image.begun_utc_ns + 250_000_000 <= after_ns
+
+
+# Aravis's fake camera has these beside RGB8.
+FAKE_FORMATS = {
+    "Mono8": "",
+    "Mono16": "",
+    "BayerRG8": "RGGB",
+    "BayerGR8": "GRBG",
+    "BayerGB8": "GBRG",
+    "BayerBG8": "BGGR",
+}
+
+
+@needs_aravis
+def test_a_fake_camera_of_others_gives_its_images_in_each_of_its_formats():
+    with fake_camera() as address, GenicamCamera(address) as camera:
+        assert set(camera.about["formats"]) == {*FAKE_FORMATS, "RGB8"}
+        for form, mosaic in FAKE_FORMATS.items():
+            camera.set({"PixelFormat": form})
+            image = camera.grab(0.01)
+            assert image.dn.shape == (512, 512) and image.bayer == mosaic
+            if form.startswith("Mono"):
+                # its grey test pattern is a ramp along the diagonal
+                upper = (image.dn >> (8 if form == "Mono16" else 0)).astype(int)
+                np.testing.assert_array_equal(upper[1:, :-1], upper[:-1, 1:])
+                assert np.ptp(upper) > 200
+        camera.set({"PixelFormat": "RGB8"})
+        with pytest.raises(InputError, match="sends RGB8; write a pixel_format of grey"):
+            camera.grab(0.01)
 
 
 @needs_aravis
@@ -155,4 +221,113 @@ def test_doctor_lists_the_cameras():
     with running_camera() as address:
         found = run_hilstar("doctor", "--json")
     checks = {check["name"]: check for check in json.loads(found.stdout)["checks"]}
-    assert address in checks["cameras"]["detail"]
+    assert f"at {address} (GigEVision)" in checks["cameras"]["detail"]
+
+
+USB = {
+    "id": "Maker-M1-777",
+    "vendor": "Maker",
+    "model": "M1",
+    "serial": "777",
+    "address": "USB3",
+    "protocol": "USB3Vision",
+}
+
+
+def test_a_usb3_camera_is_listed_as_aravis_lists_it(tmp_path, monkeypatch):
+    """Without one here: what Aravis would print of it."""
+    child = tmp_path / "child.py"
+    child.write_text(f"print({json.dumps([USB])!r})\n")
+    monkeypatch.setattr(cameras, "CHILD", child)
+    monkeypatch.setattr("hilstar.server.doctor.has_aravis", lambda: True)
+    found = run_hilstar_here("doctor", "--json")
+    checks = {check["name"]: check for check in json.loads(found.stdout)["checks"]}
+    assert checks["cameras"]["detail"] == "Maker-M1, serial 777, at USB3 (USB3Vision)"
+
+
+class LossyCamera(GigECamera):
+    """A camera that loses a packet of each of its first images for good."""
+
+    lossy = 2
+
+    def _send_block(self, block):
+        if block.number > self.lossy:
+            super()._send_block(block)
+            return
+        self._blocks.remove(block)  # none is sent again
+        for number, packet in enumerate(block.packets()):
+            if number != 2:
+                self._stream_socket.sendmsg(packet, (), 0, self.channel.destination)
+
+
+class BrokenCamera(LossyCamera):
+    """A camera that loses a packet of every image."""
+
+    lossy = 1 << 16
+
+
+class CoarseSettings(CameraSettings):
+    """Of a camera that exposes for 20 ms at least, whatever it is told."""
+
+    def __setattr__(self, name, value):
+        super().__setattr__(name, max(value, 0.02) if name == "exposure_s" else value)
+
+
+@needs_aravis
+def test_an_incomplete_image_is_refused_and_taken_again():
+    with running_camera(kind=LossyCamera) as address, GenicamCamera(address) as camera:
+        image = camera.grab(0.01)
+        assert image.incomplete == LossyCamera.lossy
+        # The camera's images are one number everywhere: nothing is of another or missing.
+        assert image.dn.min() == image.dn.max() > LossyCamera.lossy
+        assert camera.grab(0.01).incomplete == 0
+
+
+@needs_aravis
+def test_images_that_never_come_whole_are_told():
+    with (
+        running_camera(kind=BrokenCamera) as address,
+        GenicamCamera(address) as camera,
+        pytest.raises(CameraError, match="8 images in a row came incomplete"),
+    ):
+        camera.grab(0.01)
+
+
+@needs_aravis
+def test_an_exposure_that_the_camera_did_not_set_is_told_with_both_figures():
+    settings = CoarseSettings(64, 48, 12, 0.05, 20.0)
+    with running_camera(settings) as address, GenicamCamera(address) as camera:
+        assert camera.grab(0.03).exposure_s == pytest.approx(0.03)
+        with pytest.raises(InputError, match=r"exposes for 0\.02 s where 0\.005 s were asked for"):
+            camera.grab(0.005)
+
+
+@needs_aravis
+@pytest.mark.parametrize(
+    ("dn", "told"),
+    [(0, "every pixel is 0; look at the lens cap"), (4095, "3072 pixels are saturated at 4095")],
+)
+def test_black_and_saturated_images_are_told_once(tmp_path, caplog, dn, told):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN, {"tracker": {"resolution_px": [64, 48]}}))
+    settings = CameraSettings(64, 48, 12, 0.01, 50.0)
+    image = np.full((48, 64), dn, np.uint16)
+    with (
+        running_camera(settings, lambda k: image) as address,
+        closing(GrabCamera(read_bench_file(bench), address)) as source,
+    ):
+        path = source.photograph(tmp_path / "one", 0.01)
+        assert [told in record.getMessage() for record in caplog.records].count(True) == 1
+    np.testing.assert_array_equal(source.pixels(path, (64, 48)), image)
+
+
+@needs_aravis
+def test_incomplete_images_are_told_by_their_number(tmp_path, caplog):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN, {"tracker": {"resolution_px": [64, 48]}}))
+    with (
+        running_camera(kind=LossyCamera) as address,
+        closing(GrabCamera(read_bench_file(bench), address)) as source,
+    ):
+        source.photograph(tmp_path / "one", 0.01)
+    assert "one: taken again after 2 incomplete images" in caplog.text

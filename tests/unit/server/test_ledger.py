@@ -39,7 +39,7 @@ from hilstar.server.record.ledger_records import (
     FrameRecord,
     drawable_frames,
 )
-from hilstar.server.record.report import RunFigures, figures_of, summarise
+from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for
 

@@ -45,6 +45,13 @@ def test_frames_missed_and_stale_fail_beyond_one_percent(summary, changes, stric
     assert found.strict is strict and words in found.line
 
 
+def test_missed_frames_alone_are_late_and_no_wrong_sky(summary):
+    late = verdict_of(replace(summary, missed_frames=6))
+    assert not late.ok and late.line == "the sky was right, but late; 6 of 606 frames missed"
+    stale = verdict_of(replace(summary, missed_frames=6, stale_frames=1))
+    assert stale.line.startswith("the sky was not right throughout; 6 of 606")
+
+
 def test_any_time_of_a_wrong_sky_fails(summary):
     wrong = WrongSkyTotal(0.4, [ConditionTotal("rates-wrong", 1, 0.4, "by a factor")])
     found = verdict_of(replace(summary, wrong_sky=wrong))

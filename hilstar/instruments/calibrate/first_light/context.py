@@ -31,8 +31,8 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
     VirtualBench,
     black,
 )
-from hilstar.instruments.calibrate.geometric.calibration import psf_sigma_of
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen
+from hilstar.instruments.calibrate.geometric.geometry_fit import psf_sigma_of
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file, with_key
@@ -424,11 +424,7 @@ class StepContext:
     @property
     def full_dn(self) -> float:
         """The level at which the tracker saturates: its ADC's last code, or its full well, DN."""
-        detector = self.file.config.tracker.detector
-        return min(
-            2.0**detector.bits - 1,
-            detector.offset_dn + detector.full_well_e / detector.gain_e_per_dn,
-        )
+        return self.file.config.tracker.detector.saturation_dn
 
     def is_too_bright(self, looked: DarkSubtracted) -> bool:
         """Whether pixels are near the end of the tracker's range."""
@@ -436,13 +432,18 @@ class StepContext:
 
     def darker(self, code: int) -> int:
         """The code of about a quarter of the light. Raises InputError where none is left."""
-        lower = int(np.floor(code / LIGHT_STEP ** (1 / 2.2)))
-        if lower < 1:
-            raise InputError(
-                "the tracker is saturated by the darkest code; expose shorter, and write [tracker]"
-                " exposure_s so"
-            )
-        return lower
+        return darker_code(code)
+
+
+def darker_code(code: int) -> int:
+    """The code of about a quarter of the light. Raises InputError where none is left."""
+    lower = int(np.floor(code / LIGHT_STEP ** (1 / 2.2)))
+    if lower < 1:
+        raise InputError(
+            "the tracker is saturated by the darkest code; expose shorter, and write [tracker]"
+            " exposure_s so"
+        )
+    return lower
 
 
 def calibration_of(context: StepContext) -> Calibration:

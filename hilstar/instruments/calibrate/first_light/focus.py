@@ -505,6 +505,7 @@ def sharp_dots(context: StepContext) -> SharpDots:
     for number in range(context.file.config.monitor.bits * 2):
         codes = dot_image(plan, 0, context.resolution_px, code)
         looked = context.look(Pattern(f"dots_{number:03}", codes), dark)
+        # a dot that saturates the detector looks wider than it is
         if looked.raw_peak < DOT_FILL * context.full_dn:
             break
         code = context.darker(code)

@@ -28,15 +28,6 @@ from hilstar.instruments.calibrate.first_light.context import (
 )
 from hilstar.instruments.calibrate.first_light.focus import PLAN_SEED, dot_code, first_dots
 from hilstar.instruments.calibrate.first_light.image_sources import Pattern, black
-from hilstar.instruments.calibrate.geometric.calibration import (
-    Calibrated,
-    calibrate_seen,
-    dot_sigma_px,
-    notes_for_a_person,
-    parameters_of,
-    rough_geometry,
-    write_calibrated,
-)
 from hilstar.instruments.calibrate.geometric.dots import (
     DotPlan,
     dot_image,
@@ -46,6 +37,15 @@ from hilstar.instruments.calibrate.geometric.dots import (
     write_plan,
 )
 from hilstar.instruments.calibrate.geometric.fit import FIELD_DEGREES
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
+    Calibrated,
+    calibrate_seen,
+    dot_sigma_px,
+    notes_for_a_person,
+    parameters_of,
+    rough_geometry,
+    write_calibrated,
+)
 from hilstar.instruments.calibrate.geometric.observed import Observed, measure_images
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
@@ -134,6 +134,7 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
         *(np.array([(size - 1) / 2]) for size in tracker.resolution_px)
     )
     width, height = monitor.resolution_px
+    # Where the bench file has the tracker look far beside the middle, it may well be wrong.
     if not (abs(middle_x - width / 2) < width / 4 and abs(middle_y - height / 2) < height / 4):
         middle_x = (width - 1) / 2
         middle_y = (height - 1) / 2

@@ -36,7 +36,7 @@ from hilstar.display.render.backend import ScreenView
 from hilstar.display.render.context import leave_contexts
 from hilstar.display.render.presenter import Presenter, level_texture, window_context
 from hilstar.display.window.this_monitor import identity_here
-from hilstar.instruments.calibrate.geometric.observed import read_image
+from hilstar.instruments.calibrate.geometric.observed import read_image, saturated_pixels
 from hilstar.instruments.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import (
@@ -50,11 +50,17 @@ from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_camera
-from hilstar.server.bench.frame_files import png_of, write_codes_png
+from hilstar.server.bench.frame_files import png_of, write_codes_png, write_fits
 from hilstar.server.bench.measured_on import check_monitor
 from hilstar.server.bench.monitor import calibration_source, orientation_of
 from hilstar.server.frame_feed import lit_codes
-from hilstar.server.genicam.camera import PREFIX, CameraError, GenicamCamera, chosen_format
+from hilstar.server.genicam.camera import (
+    PREFIX,
+    CameraError,
+    CameraImage,
+    GenicamCamera,
+    chosen_format,
+)
 from hilstar.server.screen.gate import Timing, pass_gate
 from hilstar.server.screen.screen import Screen, marker_light
 from hilstar.tracker.detector import Detector
@@ -154,6 +160,13 @@ class ImageSource:
         """
         raise NotImplementedError
 
+    def photograph(self, stem: Path, exposure_s: float) -> Path:
+        """The tracker's image of whatever is before it, `stem` with an ending. Raises NoImage."""
+        raise NotImplementedError
+
+    def check_photographs(self) -> None:
+        """Refuse (InputError) a source that has no `photograph`."""
+
     def pixels(self, path: Path, resolution_px: tuple[int, int]) -> FloatArray:
         """The pixels (h, w) of an image that this source took, DN. Raises InputError for one
         that cannot be read.
@@ -182,7 +195,7 @@ class ImageSource:
 
     def hand_on(self, frames: "PatternFrames") -> None:
         """Hand the patterns to watchers, too. Raises InputError without a display."""
-        raise InputError("--frames: this session shows nothing here; leave --frames out")
+        raise InputError("--feed: this session shows nothing here; leave --feed out")
 
     def close(self) -> None:
         """Free the display."""
@@ -498,28 +511,43 @@ class GrabCommand(_ShownHere):
         """Run the command while the pattern is shown. Raises NoImage with the last line of its
         stderr where it fails.
         """
-        output = stem.with_name(stem.name + ".png")
-        shown = stem.parent / PATTERN_FILE
-        command = self._words
-        for name, value in (
-            ("output", str(output)),
-            ("pattern", str(shown)),
-            ("exposure_s", f"{exposure_s:.9g}"),
-        ):
-            command = [word.replace(f"{{{name}}}", value) for word in command]
-        # an interrupted attempt may have left one, and a command that writes nothing must fail
-        output.unlink(missing_ok=True)
         if self._shows and pattern.later:
             raise InputError(
                 "a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show"
                 " them here"
             )
+        if not self._shows:
+            return self._taken(
+                stem, exposure_s, lambda done: self._display.show_until(file, pattern, done)
+            )
+        monitor = file.config.monitor
+        shown = on_screen(pattern.codes, orientation_of(monitor))
+        write_codes_png(stem.parent / PATTERN_FILE, shown, monitor.bits)
+        return self._taken(stem, exposure_s, _wait)
+
+    def photograph(self, stem: Path, exposure_s: float) -> Path:
+        """Run the command. Raises NoImage as `look` does."""
+        return self._taken(stem, exposure_s, _wait)
+
+    def check_photographs(self) -> None:
+        """Refuse (InputError) a command that shows patterns."""
         if self._shows:
-            monitor = file.config.monitor
-            write_codes_png(shown, on_screen(pattern.codes, orientation_of(monitor)), monitor.bits)
-            _run(command, output, _wait)
-        else:
-            _run(command, output, lambda done: self._display.show_until(file, pattern, done))
+            raise InputError("--grab: has {pattern}, and nothing is shown here; leave it out")
+
+    def _taken(
+        self, stem: Path, exposure_s: float, meanwhile: Callable[[Callable[[], bool]], None]
+    ) -> Path:
+        output = stem.with_name(stem.name + ".png")
+        command = self._words
+        for name, value in (
+            ("output", str(output)),
+            ("pattern", str(stem.parent / PATTERN_FILE)),
+            ("exposure_s", f"{exposure_s:.9g}"),
+        ):
+            command = [word.replace(f"{{{name}}}", value) for word in command]
+        # an interrupted attempt may have left one, and a command that writes nothing must fail
+        output.unlink(missing_ok=True)
+        _run(command, output, meanwhile)
         return output
 
 
@@ -542,6 +570,7 @@ class GrabCamera(_ShownHere):
         super().__init__(dark, diode)
         tracker = file.config.tracker
         self.identity = f"grab: {PREFIX}{name}"
+        self._told_black: set[bool] = set()
         self._camera = GenicamCamera(name)
         try:
             about = self._camera.about
@@ -555,7 +584,27 @@ class GrabCamera(_ShownHere):
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """The camera's image of a pattern: a PNG of 16 bits. Raises NoImage."""
-        images: list[CodeImage] = []
+        image = self._taken(
+            stem.name, exposure_s, lambda done: self._display.show_until(file, pattern, done)
+        )
+        self._tell_black(image, stem.name, lit=any(codes.any() for codes in pattern.frames))
+        path = stem.with_name(stem.name + ".png")
+        picture = png_of(image.dn)
+        written(path, lambda output: output.write(picture))
+        return path
+
+    def photograph(self, stem: Path, exposure_s: float) -> Path:
+        """The camera's image as FITS, with its exposure and when it began. Raises NoImage."""
+        image = self._taken(stem.name, exposure_s, _wait)
+        self._tell_black(image, stem.name, lit=True)
+        path = stem.with_name(stem.name + ".fits")
+        write_photograph(path, image)
+        return path
+
+    def _taken(
+        self, name: str, exposure_s: float, meanwhile: Callable[[Callable[[], bool]], None]
+    ) -> CameraImage:
+        images: list[CameraImage] = []
         begun = False
 
         def done() -> bool:
@@ -570,21 +619,53 @@ class GrabCamera(_ShownHere):
             return bool(images)
 
         try:
-            self._display.show_until(file, pattern, done)
+            meanwhile(done)
         except CameraError as error:
             raise NoImage(str(error)) from error
         image = images[0]
-        if not image.any():
-            log.warning("%s: every pixel is 0; look at the lens cap and the black level", stem.name)
-        path = stem.with_name(stem.name + ".png")
-        picture = png_of(image)
-        written(path, lambda output: output.write(picture))
-        return path
+        clipped = saturated_pixels(image.dn)
+        if clipped:
+            log.warning(
+                "%s: %d pixels are saturated at %d",
+                name,
+                clipped,
+                image.dn.max(),
+            )
+        if image.incomplete:
+            log.warning("%s: taken again after %d incomplete images", name, image.incomplete)
+        return image
+
+    def _tell_black(self, image: CameraImage, name: str, *, lit: bool) -> None:
+        """Tell the first image that is 0 everywhere, of a lit pattern and of a black one."""
+        if image.dn.any() or lit in self._told_black:
+            return
+        self._told_black.add(lit)
+        if lit:
+            advice = "look at the lens cap, the exposure and the camera's black level"
+        else:
+            advice = "a black level above 0 would show the noise of dark pixels"
+        log.warning("%s: every pixel is 0; %s", name, advice)
 
     def close(self) -> None:
         """Close the display and let the camera go."""
         super().close()
         self._camera.close()
+
+
+def write_photograph(path: Path, image: CameraImage) -> None:
+    """Write a camera's image as FITS, its first row at the top. Raises InputError where that cannot
+    be done.
+    """
+    from astropy.io import fits
+
+    begun = np.datetime64(image.begun_utc_ns, "ns").astype("datetime64[us]")
+    hdu = fits.PrimaryHDU(image.dn)
+    hdu.header["DATE-OBS"] = str(begun), "UTC, the exposure's start"
+    hdu.header["EXPTIME"] = image.exposure_s, "s"
+    hdu.header["ROWORDER"] = "TOP-DOWN"
+    if image.bayer:
+        hdu.header["BAYERPAT"] = image.bayer
+    write_fits(path, hdu)
 
 
 def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]], None]) -> None:

@@ -19,7 +19,8 @@ from hilstar.basics.pages import (
     Markup,
     Verdict,
     escaped,
-    key_words,
+    key_table,
+    keyed_rows,
     measured,
     page_of,
     paragraph,
@@ -75,16 +76,15 @@ def _bench_file(session: SessionFile, before: Path) -> Card:
 
 
 def _verdict(records: list[StepRecord]) -> Verdict:
-    by = {
-        verdict: [record.name for record in records if record.verdict == verdict]
-        for verdict in WORDS
-    }
-    passed = f"{len(by['done'])} of {len(records)} steps passed"
+    names: dict[str, list[str]] = {verdict: [] for verdict in WORDS}
+    for record in records:
+        names[record.verdict].append(record.name)
+    passed = f"{len(names['done'])} of {len(records)} steps passed"
     missed = ""
-    if by["skipped"]:
-        missed = f"; not measured: {', '.join(by['skipped'])}"
-    if by["failed"]:
-        headline = f"Not ready: {', '.join(by['failed'])} failed"
+    if names["skipped"]:
+        missed = f"; not measured: {', '.join(names['skipped'])}"
+    if names["failed"]:
+        headline = f"Not ready: {', '.join(names['failed'])} failed"
         return Verdict(BAD, headline, f"{passed}{missed}. Each card says what to do.")
     if missed or len(records) < len(STEPS):
         return Verdict(WARN, "What was measured is in order", f"{passed}{missed}.")
@@ -99,7 +99,7 @@ def _link(record: StepRecord) -> str:
 
 def _card(folder: Path, step: SessionStep, record: StepRecord, session: SessionFile) -> Card:
     pictures = [_picture(folder / name) for name in record.pictures]
-    figures = [(key_words(name), value) for name, value in record.figures.items()]
+    figures = keyed_rows(record.figures)
     beside = figures[:MAX_FIGURES_BESIDE] if pictures else []
     return Card(
         title=step.name.capitalize(),
@@ -139,13 +139,13 @@ def _cure(step: SessionStep, record: StepRecord, session: SessionFile) -> str:
     return Markup(f"{escaped(step.cure)} Then, as before: <code>{escaped(again)}</code>")
 
 
-def _figure_table(figures: Sequence[tuple[str, object]]) -> Iterator[str]:
+def _figure_table(figures: Sequence[tuple[str, str]]) -> Iterator[str]:
     if figures:
-        yield table_of(figures)
+        yield key_table(figures)
 
 
 def _details(
-    record: StepRecord, pictures: list[str], figures: Sequence[tuple[str, object]]
+    record: StepRecord, pictures: list[str], figures: Sequence[tuple[str, str]]
 ) -> Iterator[str]:
     yield paragraph(f"{record.ended}, {record.seconds:.1f} s", "small")
     yield from pictures

@@ -721,7 +721,7 @@ class Photometer:
         lit: dict[int, _Reading],
         links: list[LatticeRatio],
     ) -> FloatArray:
-        """What the error of each ratio does to light (n,): (n, ratios). Light of a range is divided
+        """Changes (n, ratios) of light (n,) by one sigma of each ratio. Light of a range is divided
         by all ratios below it.
         """
         effects = np.zeros((len(light), len(links)))
@@ -774,7 +774,9 @@ class Photometer:
         pairs: list[_Pair],
         links: list[LatticeRatio],
     ) -> FloatArray:
-        """What the ADC's lowest code adds to light (n,) where it cuts off a dark pixel's noise."""
+        """The light (n,) that the ADC's lowest code adds where it cuts off the noise of dark
+        pixels.
+        """
         effect = np.zeros(len(values.light))
         for order, reading in lit.items():
             effect[order] = self._cut_dn(reading.at, reading.light_dn) * values.per_dn[order]
@@ -787,7 +789,7 @@ class Photometer:
         return effect
 
     def _cut_dn(self, at: Range, light_dn: float) -> float:
-        """What the cut at code 0 adds to the sum of a lattice's image above black, DN."""
+        """The DN that the cut at code 0 adds to the sum of a lattice's image above black."""
         detector = self.context.file.config.tracker.detector
         stated_dn = detector.electronics_e / detector.gain_e_per_dn
         read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px, math.inf)
@@ -813,8 +815,8 @@ class Photometer:
         return before_adc_dn(variance_dn2 / pixels, stated_dn)
 
     def _rounded(self, at: Range, light_dn: float) -> FloatArray:
-        """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the
-        dark level's place.
+        """The DN (STEP_PHASES,) that the ADC's rounding adds to the sum of a lattice's image above
+        black, by where the dark level lies between two codes.
         """
         dark_dn = self._noise_dn(
             self.scatter.dark_dn2(at.times), self.scatter.dark_sum_dn(at.times)

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -184,7 +184,7 @@ class StarSpot:
 
 
 class Beyond(NamedTuple):
-    """What residuals have beyond their noise: a standard deviation, and its bounds of 95 % below
+    """The scatter of residuals beyond their noise: a standard deviation, and its 95 % bounds below
     and above.
     """
 
@@ -194,8 +194,8 @@ class Beyond(NamedTuple):
 
     @classmethod
     def of(cls, residual: FloatArray, noise: FloatArray) -> "Beyond":
-        """Of residuals (n,) and the noise (n,) of each: the weighted mean of what their squares
-        have more.
+        """The scatter of residuals (n,) beyond their noise (n,): the square root of the weighted
+        mean of residual^2 - noise^2.
         """
         weight = 1 / (noise**2 + float(np.median(noise)) ** 2) ** 2
         more = float((weight * (residual**2 - noise**2)).sum() / weight.sum())
@@ -259,7 +259,7 @@ class StarsSeen:
 
     @property
     def beyond_px(self) -> Beyond:
-        """What places have beyond their noise, along one axis."""
+        """The scatter of the stars' places beyond their noise, along one axis, px."""
         return Beyond.of(self.residual_px.ravel(), np.repeat(self.place_noise_px, 2))
 
     def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> "Scatter":
@@ -364,19 +364,16 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
         ]
         patterns = [Pattern(name, codes[0], codes[1:]) for name in names]
         fields.append(_compared(context, patterns, dark, wanted, spot))
-    arrays = []
-    for field in dataclasses.fields(StarsSeen):
-        if field.name not in {"lost", "frames", "images"}:
-            arrays.append(field.name)
-    stars_seen = StarsSeen(
-        **{
-            name: np.concatenate([getattr(field_stars, name) for field_stars in fields])
-            for name in arrays
-        },
-        lost=sum(field_stars.lost for field_stars in fields),
-        frames=frames,
-        images=(*dark_paths, *(path for field_stars in fields for path in field_stars.images)),
-    )
+    columns: dict[str, Any] = {}
+    for column in dataclasses.fields(StarsSeen):
+        if column.name not in {"lost", "frames", "images"}:
+            parts = [getattr(field_stars, column.name) for field_stars in fields]
+            columns[column.name] = np.concatenate(parts)
+    images = list(dark_paths)
+    for field_stars in fields:
+        images.extend(field_stars.images)
+    lost = sum(field_stars.lost for field_stars in fields)
+    stars_seen = StarsSeen(**columns, lost=lost, frames=frames, images=tuple(images))
     if len(stars_seen.dn) < MIN_STARS:
         raise InputError(_why_few(stars_seen, spot, len(shown)))
     return stars_seen

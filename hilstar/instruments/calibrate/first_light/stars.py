@@ -46,7 +46,7 @@ LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")
 # sigmas that 95 % of distances in two axes, and in one, are within
 P95_OF_TWO, P95_OF_ONE = 2.4477, 1.9600
 MAX_FRAMES = 25  # of a field that are taken without being asked for
-MAX_ASKED_FRAMES = 1000  # of a field: the most that first-light --frames takes
+MAX_ASKED_FRAMES = 1000  # of a field: the most that first-light --average takes
 GRID = 21  # places along each side of the screen at which a truth is compared
 READINGS_FILE = "readings.csv"  # stars and their DN, as `calibrate scale --reading` takes them
 BLACK_LEVEL, BLACK_ERROR = "photometry.black_level", "photometry.black_level_error"
@@ -195,7 +195,7 @@ def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
     cure = "write a longer [tracker] exposure_s"
     if wanted <= MAX_ASKED_FRAMES:
         cure = (
-            f"{wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker]"
+            f"{wanted} frames of each field would tell (--average {wanted}), or a longer [tracker]"
             " exposure_s"
         )
     return [

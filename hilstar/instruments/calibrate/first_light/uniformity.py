@@ -398,7 +398,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     bad = dark > HOT_FILL * context.full_dn
     # a dot that reaches the detector's edge has lost light
     bad[[0, -1]], bad[:, [0, -1]] = True, True
-    lattices = [[period // 2 + period // 2 * half for half in shift] for shift in SHIFTS]
+    # their first dots' places; shifts are in half periods
+    lattices = [[period // 2 * (1 + right), period // 2 * (1 + down)] for right, down in SHIFTS]
     _, looks = _unsaturated(context, dark, "lattice", lattices, period)
     noise_dn = noisiest_background(looks[-1].image).noise
     size = np.array(context.resolution_px)

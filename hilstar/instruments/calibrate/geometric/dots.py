@@ -215,11 +215,9 @@ def lit_for(seen: SeenScreen) -> int:
         MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px)
     )
     low, high = seen.box()
-    x, y = (
-        part.ravel()
-        for part in np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)))
-    )
-    area_px = float(np.prod(high - low)) * float(seen.shows(x, y).mean()) * ratio**2
+    x, y = np.meshgrid(*np.linspace(low, high, GRID).T)
+    shown_share = float(seen.shows(x.ravel(), y.ravel()).mean())
+    area_px = float(np.prod(high - low)) * shown_share * ratio**2
     return int(np.clip(area_px / apart_px**2, MIN_LIT_DOTS, MAX_LIT_DOTS))
 
 
@@ -364,7 +362,8 @@ def read_plan(path: Path) -> DotPlan:
         rows.append((frame, dot, x, y))
     if not rows:
         raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
-    place = {dot: k for k, dot in enumerate(sorted({dot for _, dot, _, _ in rows}))}
+    dots = sorted({dot for _, dot, _, _ in rows})
+    place = {dot: k for k, dot in enumerate(dots)}
     x_px = np.full(len(place), np.nan)
     y_px = np.full(len(place), np.nan)
     lit = np.zeros((len(place), max(frame for frame, *_ in rows) + 1), dtype=bool)

@@ -26,7 +26,7 @@ ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, s
 FITS_ENDINGS = (".fits", ".fit", ".fts")
 MAX_IMAGE_BYTES = 500_000_000
 # share of pixels at the image's largest possible value: a few hot pixels do not matter
-SATURATED_SHARE = 1e-5
+SATURATED_SHARE, SATURATED_PIXELS = 1e-5, 20
 FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
 THRESHOLD_SIGMA = 8.0
 # A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter
@@ -163,18 +163,26 @@ def _centroids(
     path: Path, resolution_px: tuple[int, int], under: FloatArray | None, settings: CentroidSettings
 ) -> tuple[FloatArray, FloatArray]:
     image = read_image(path, resolution_px)
-    top = float(image.max())
-    saturated = int((image == top).sum())
-    if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
+    saturated = saturated_pixels(image)
+    if saturated:
         raise InputError(
-            f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the"
-            " dots darker"
+            f"{path}: {saturated} pixels are saturated at {image.max():.0f}; expose shorter, or"
+            " show the dots darker"
         )
     if under is not None:
         image = image - under
     stars = find_stars(image, settings, noisiest_background(image))
     is_whole = ~stars.at_edge
     return stars.x_px[is_whole], stars.y_px[is_whole]
+
+
+def saturated_pixels(image: npt.NDArray[Any]) -> int:
+    """How many pixels of an image (h, w), DN, are at full scale; 0 where they may be hot ones."""
+    top = float(image.max())
+    count = int((image == top).sum())
+    if top in FULL_DN and count > max(SATURATED_PIXELS, SATURATED_SHARE * image.size):
+        return count
+    return 0
 
 
 def read_image(

@@ -53,7 +53,9 @@ STEP_WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What a bench and its sender give: primaries known in the tracker's colours, and rates."""
+    """Whether a bench knows its primaries in the tracker's colours, and whether its sender gives
+    rates.
+    """
 
     primaries: bool
     rates: bool

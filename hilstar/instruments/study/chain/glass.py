@@ -9,6 +9,7 @@ whole basis, integrated over pixels star by star.
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,9 +23,10 @@ from hilstar.instruments.simulate.glass import told_psf
 from hilstar.instruments.simulate.noise import field_stars
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.study.chain.choices import ChainScene
-from hilstar.instruments.study.chain.measuring import AUTO, Times, rounded, said, times_of
+from hilstar.instruments.study.chain.measuring import AUTO, rounded, said, times_of
 from hilstar.instruments.study.sweep import MAX_ROUNDS, in_turn, pareto_front
 from hilstar.optics.glass.glass_psf import GlassPsf
+from hilstar.optics.layers.view import View
 from hilstar.optics.psf import Psf
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import least_tracker_psf, tracker_psf
@@ -93,18 +95,15 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         if not errors:
             return []
         view = next(iter(simulators.values())).view(scene.q_icrs_to_cam, np.zeros(3))
-        works = {
-            name: lambda number, one=one: one.expose(view, np.random.default_rng((SEED, number)))
-            for name, one in simulators.items()
-        }
-        taken = in_turn(works, MAX_ROUNDS, (QUICK_TIME_S if quick else TIME_S) / len(works))
-    times: dict[str, Times] = {name: times_of(np.array(one)) for name, one in taken.items()}
-    fronts = pareto_front(
-        [errors[name][1] for name in drawable], [times[name].time_ms for name in drawable]
-    )
-    auto = least_tracker_psf(
-        whole, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
-    )[1].choice
+        works = {name: partial(_exposed, simulator, view) for name, simulator in simulators.items()}
+        time_s = QUICK_TIME_S if quick else TIME_S
+        spent_by_name = in_turn(works, MAX_ROUNDS, time_s / len(works))
+    times = {name: times_of(np.array(spent)) for name, spent in spent_by_name.items()}
+    errors_arcsec = [errors[name][1] for name in drawable]
+    fronts = pareto_front(errors_arcsec, [times[name].time_ms for name in drawable])
+    tolerance = tracker.tolerance_mag, tracker.tolerance_px
+    _, reason = least_tracker_psf(whole, tracker.resolution_px, tolerance)
+    auto = reason.choice
     return [
         GlassRow(
             scene.name,
@@ -117,6 +116,11 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         )
         for (name, psf), on in zip(drawable.items(), fronts, strict=True)
     ]
+
+
+def _exposed(simulator: Simulator, view: View, number: int) -> object:
+    """The exposure of one round."""
+    return simulator.expose(view, np.random.default_rng((SEED, number)))
 
 
 def _drawable(whole: GlassPsf) -> Iterator[tuple[str, Psf]]:

@@ -91,7 +91,9 @@ class DrawingChain:
         levels = self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude)).levels.ravel()
         place = np.flatnonzero(levels)
         light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
-        return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
+        if panel.uniformity is not None:
+            light = light * panel.uniformity.ravel()[place]
+        return place, light
 
     def exposed(self, seen: choices.PanelExposure) -> FloatArray:
         """The mean light (H, W) over an exposure; at rest one frame stands for all, except with
@@ -309,7 +311,7 @@ class SceneMeasurement:
         ]
 
     def untimed(self) -> list[CombinationRow]:
-        """Every combination's error, which no machine changes, without times."""
+        """Every combination's error, which is the same on every machine; its times are NaN."""
         untimed = Times(math.nan, math.nan, math.nan, math.nan, 0)
         return [self.row(self.chain(combination), untimed) for combination in self.combinations]
 
@@ -356,10 +358,8 @@ def rms_of_known(values: Sequence[float]) -> float:
 
 def pooled(found: Sequence[Off]) -> tuple[float, float]:
     """The rms over the stars of several exposures, arcsec and mag."""
-    arcsec, mag = (
-        np.concatenate([getattr(field_errors, name) for field_errors in found])
-        for name in ("arcsec", "mag")
-    )
+    arcsec = np.concatenate([field_errors.arcsec for field_errors in found])
+    mag = np.concatenate([field_errors.mag for field_errors in found])
     return math.sqrt(float(np.mean(arcsec**2))), math.sqrt(float(np.mean(mag**2)))
 
 
@@ -409,32 +409,27 @@ def rounded(value: float) -> float:
 
 def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
     """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
-    errors_by_part = [
-        [
-            judge.sky,
-            *(
-                judge.measure(scene.tracker.image_e(light, judge.seen))
-                for light in _lights(scene, combination, number)
-            ),
-        ]
-        for number, judge in enumerate(scene.judges)
-    ]
+    # by exposure: what is measured in the sky itself, then behind each step
+    measured_by_step = []
+    for number, judge in enumerate(scene.judges):
+        measured = [judge.sky]
+        for light in _lights(scene, combination, number):
+            measured.append(judge.measure(scene.tracker.image_e(light, judge.seen)))
+        measured_by_step.append(measured)
 
     def between(before: int, after: int) -> tuple[float, float]:
-        return pooled(
-            [
-                off(judge, field_errors[after], field_errors[before])
-                for judge, field_errors in zip(scene.judges, errors_by_part, strict=True)
-            ]
-        )
+        offs = []
+        for judge, measured in zip(scene.judges, measured_by_step, strict=True):
+            offs.append(off(judge, measured[after], measured[before]))
+        return pooled(offs)
 
-    parts = [between(k, k + 1) for k in range(len(STEPS))]
-    arcsec, mag = (
-        float(np.sqrt(sum(value**2 for value in column))) for column in zip(*parts, strict=True)
-    )
-    named = zip((*STEPS, RSS, WHOLE), (*parts, (arcsec, mag), between(0, -1)), strict=True)
+    errors = {step: between(k, k + 1) for k, step in enumerate(STEPS)}
+    arcsec, mag = np.sqrt(np.sum(np.square(list(errors.values())), axis=0)).tolist()
+    errors[RSS] = arcsec, mag
+    errors[WHOLE] = between(0, -1)
     return [
-        ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named
+        ErrorPart(scene.scene.name, AUTO, step, rounded(arcsec), rounded(mag))
+        for step, (arcsec, mag) in errors.items()
     ]
 
 
@@ -449,9 +444,8 @@ def _lights(
     every = scene.parts.own.stars
 
     def exposed(light_of: Callable[[int, int], choices.Lit]) -> FloatArray:
-        return (visible.mean if movement.turns else visible.at_rest)(
-            light_of, bench.camera.resolution_px
-        )
+        light_by_pixel = visible.mean if movement.turns else visible.at_rest
+        return light_by_pixel(light_of, bench.camera.resolution_px)
 
     def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> choices.Lit:
         if along_paths:

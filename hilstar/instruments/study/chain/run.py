@@ -106,10 +106,9 @@ def without_fronts(row: CombinationRow) -> CombinationRow:
 
 def front(rows: Sequence[CombinationRow], error: str) -> list[bool]:
     """Whether each row is on the front of its time and `error`, the name of one of its columns."""
-    return [
-        bool(on)
-        for on in pareto_front([getattr(row, error) for row in rows], [row.time_ms for row in rows])
-    ]
+    errors = [getattr(row, error) for row in rows]
+    times_ms = [row.time_ms for row in rows]
+    return list(map(bool, pareto_front(errors, times_ms)))
 
 
 def auto_of(rows: Sequence[CombinationRow]) -> int:
@@ -416,15 +415,13 @@ def draw_budget(
     scenes = differing(rows)
     last = list(scenes)[-1]
     steps = [part.step for part in budget if part.scene == next(iter(scenes)) and part.step != RSS]
-    shown = [
-        step
-        for step in steps
-        if any(p.error_arcsec or p.error_mag for p in budget if p.step == step)
-    ]
-    none = [WORDS.get(step, step) for step in steps if step not in shown]
-    note = "Each step is charged with what it changes when it is added to an exact display" + (
-        f"; {' and '.join(none)} change nothing here." if none else "."
-    )
+    steps_with_error = {part.step for part in budget if part.error_arcsec or part.error_mag}
+    shown = [step for step in steps if step in steps_with_error]
+    none = [WORDS.get(step, step) for step in steps if step not in steps_with_error]
+    note = "Each step is charged with what it changes when it is added to an exact display"
+    if none:
+        note += f"; {' and '.join(none)} change nothing here"
+    note += "."
     most = []
     for scene in scenes:
         parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
@@ -456,10 +453,10 @@ def draw_budget(
                 charts.value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
                 axes.set_xlabel(f"error, rms [{unit}]" if scene == last else "")
             light.set_yticklabels([])
-            mine = [one for one in stages if one.scene == scene]
-            charts.value_bars(
-                times, [one.stage for one in mine], [one.time_ms for one in mine], charts.PURPLE
-            )
+            scene_stages = [stage for stage in stages if stage.scene == scene]
+            stage_names = [stage.stage for stage in scene_stages]
+            stage_times_ms = [stage.time_ms for stage in scene_stages]
+            charts.value_bars(times, stage_names, stage_times_ms, charts.PURPLE)
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
@@ -505,11 +502,9 @@ def run(
     load = others.load()
     if load.busy:
         rows = [without_fronts(row) for row in rows]
-    lines = [
-        *(scene_line(*scene, load) for scene in judged),
-        *lines,
-        *([glass_line(glass)] if glass else []),
-    ]
+    lines = [*(scene_line(*scene, load) for scene in judged), *lines]
+    if glass:
+        lines.append(glass_line(glass))
     make_directory(directory)
     for name, records in (
         ("chain", rows),
@@ -519,11 +514,11 @@ def run(
     ):
         if records:
             charts.write_records(directory / f"{name}.csv", records)
-    notes = [
-        f"times on {machine}",
-        *([] if shortened is None else [shortened]),
-        *([load.caution] if load.busy else []),
-    ]
+    notes = [f"times on {machine}"]
+    if shortened is not None:
+        notes.append(shortened)
+    if load.busy:
+        notes.append(load.caution)
     draw(directory / "chain", rows, headline(rows, load), "; ".join(notes), glass)
     draw_budget(directory / "chain_budget", rows, budget, stages, load)
     right = not any(beating(chain_rows, as_filed=True)[0] for chain_rows, _, _ in judged)

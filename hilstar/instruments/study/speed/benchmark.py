@@ -32,8 +32,8 @@ from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.render.variants import StagedRenderer
-from hilstar.instruments.study.settings import FULL_HD, Table, Value, bench_text
 from hilstar.instruments.study.speed import report, tracker
+from hilstar.instruments.study.study_benches import FULL_HD, Table, Value, bench_text
 from hilstar.instruments.study.sweep import OtherWork
 from hilstar.optics.psf import SQRT2, GaussianPsf
 from hilstar.optics.sprites import Candidates, FrameLight, clipped_sprites, pack_sprites

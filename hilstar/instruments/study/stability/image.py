@@ -411,13 +411,12 @@ def flux_range() -> FailureCase:
     with by_renderer(on) as draw:
         image = draw(join_sprites(stars, stars[0].footprint_px))
     scaled = np.rint(image / image.max() * 65535) * image.max() / 65535
-    errors, faults = (
-        [
-            abs(float(shown[:, part].sum()) / light - 1)
-            for part, light in zip((slice(110), slice(110, None)), flux, strict=True)
-        ]
-        for shown in (image, scaled)
-    )
+
+    def flux_errors(shown: FloatArray) -> list[float]:
+        bright, faint = float(shown[:, :110].sum()), float(shown[:, 110:].sum())
+        return [abs(bright / flux[0] - 1), abs(faint / flux[1] - 1)]
+
+    errors, faults = flux_errors(image), flux_errors(scaled)
     return FailureCase(
         "flux range 1e12",
         "16 bits, scaled to the brightest pixel",
@@ -605,7 +604,7 @@ def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
 def judged(
     case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR
 ) -> FailureCase:
-    """Rounding against `exact`, by the light of each group of stars."""
+    """Compares rounding with `exact` by the light of each group of stars."""
     fault = error_steps(codes_of(scene, "round"), scene)
     error = error_steps(exact_codes(scene), scene)
     return FailureCase(

@@ -31,7 +31,11 @@ from hilstar.instruments.study.codes import (
     star_field,
 )
 from hilstar.instruments.study.predictors import ORION
-from hilstar.instruments.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
+from hilstar.instruments.study.study_benches import (
+    MAX_RELIABLE_VI_MAG,
+    held_out_errors,
+    study_optics,
+)
 from hilstar.instruments.study.tradeoff.places import (
     NO_LIMIT_V_MAG,
     SPRITE_PSF,

@@ -19,7 +19,7 @@ from hilstar.instruments.study.tradeoff.places import (
     projection,
     smear,
 )
-from hilstar.instruments.study.trials import Trials, draw_trials, measured, table_lines
+from hilstar.instruments.study.trials import Trial, Trials, draw_trials, measured, table_lines
 from hilstar.tracker.centroiders import FAMILY
 
 # In the order of the chain.
@@ -56,21 +56,15 @@ def run(directory: Path, quick: bool = False) -> Judged:
     A step that was timed on a busy machine has no front: its `front` and `beaten_by` are empty.
     """
     machine = this_machine()
+    budget_s = QUICK_BUDGET_S if quick else BUDGET_S
     steps = []
+    rows = []
     for plan in STEPS:
         with ExitStack() as stack:
-            steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
-        draw_trials(directory / f"tradeoff_{steps[-1].name}", steps[-1], machine)
-    rows = [
-        (
-            *(step.name, step.work, row.method, row.error, step.error.unit, step.error.name),
-            *(row.second, step.second.unit, step.second.name, row.time_ms, *row.quartiles_ms),
-            *(row.is_default, row.is_exact, "" if step.load.busy else row.on_front, row.beaten),
-            *(row.more.get(name, "") for name in MORE_COLUMNS),
-        )
-        for step in steps
-        for row in step.trials
-    ]
+            step = measured(plan(stack, quick), budget_s)
+        draw_trials(directory / f"tradeoff_{step.name}", step, machine)
+        steps.append(step)
+        rows += [_table_row(step, trial) for trial in step.trials]
     write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), rows)
     head = (
         f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast;"
@@ -78,6 +72,18 @@ def run(directory: Path, quick: bool = False) -> Judged:
     )
     load = max((step.load for step in steps), key=lambda load: load.cores)
     return load.judged([head, *(line for step in steps for line in table_lines(step))])
+
+
+def _table_row(step: Trials, trial: Trial) -> list[object]:
+    """A trial's cells, by COLUMNS and MORE_COLUMNS."""
+    on_front = "" if step.load.busy else trial.on_front
+    more = [trial.more.get(name, "") for name in MORE_COLUMNS]
+    return [
+        *(step.name, step.work, trial.method, trial.error, step.error.unit, step.error.name),
+        *(trial.second, step.second.unit, step.second.name, trial.time_ms, *trial.quartiles_ms),
+        *(trial.is_default, trial.is_exact, on_front, trial.beaten),
+        *more,
+    ]
 
 
 def this_machine() -> str:

@@ -239,11 +239,10 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
             render = msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG)
         if render.colour == "depth":
             render = msgspec.structs.replace(render, bit_stealing=True)
-        if (
-            sky.epoch_utc not in {FROM_SOURCE, UNIX}
-            and (utc_ns := epoch_utc_ns(config)) is not None
-        ):
-            sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
+        if sky.epoch_utc not in {FROM_SOURCE, UNIX}:
+            utc_ns = epoch_utc_ns(config)
+            if utc_ns is not None:
+                sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
         return msgspec.structs.replace(config, render=render, sky=sky)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

@@ -28,6 +28,7 @@ MS_PER_S = 1000.0
 NETWORK_PORT = "rfc2217://"
 ROUNDING = 1e-6  # relative: 0.1 s at 10 Hz is one exposure after the other
 QUANTUM_EFFICIENCY = "quantum_efficiency"
+EFFICIENCIES_BY_COLOUR = tuple(f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb")
 
 
 GAUSSIAN = "gaussian"
@@ -167,30 +168,28 @@ class Tracker(Table, frozen=True):
         """The quantum efficiency of each channel by its key: one, or those of red, green and
         blue.
         """
-        given = {
-            key: getattr(self, key)
-            for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb"))
-        }
-        return {key: value for key, value in given.items() if value is not None}
+        efficiencies = {}
+        for key in (QUANTUM_EFFICIENCY, *EFFICIENCIES_BY_COLOUR):
+            value = getattr(self, key)
+            if value is not None:
+                efficiencies[key] = value
+        return efficiencies
 
 
 def check_channels(tracker: Tracker) -> None:
     """Refuse (InputError) a tracker with neither one quantum efficiency nor three."""
     given = tracker.quantum_efficiencies
-    missing = [
-        key for key in (f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb") if key not in given
-    ]
+    missing = [key for key in EFFICIENCIES_BY_COLOUR if key not in given]
     if QUANTUM_EFFICIENCY in given and len(given) > 1:
         raise InputError(
             f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or"
             " _r, _g and _b"
         )
     if tracker.detector.bayer is not None and QUANTUM_EFFICIENCY in given:
-        three = ", ".join(f"{QUANTUM_EFFICIENCY}_{letter}" for letter in "rgb")
         raise InputError(
             f'[tracker.detector] bayer = "{tracker.detector.bayer}" has three colours of pixels,'
-            f" and [tracker] one {QUANTUM_EFFICIENCY}; write {three} in its place, or leave"
-            " bayer out"
+            f" and [tracker] one {QUANTUM_EFFICIENCY}; write {', '.join(EFFICIENCIES_BY_COLOUR)} in"
+            " its place, or leave bayer out"
         )
     if missing and QUANTUM_EFFICIENCY not in given:
         key = missing[0] if given else QUANTUM_EFFICIENCY

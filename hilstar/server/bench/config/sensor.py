@@ -1,9 +1,10 @@
 """A bench's sensor by its name: the sheet's figures under the keys of the bench file."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from hilstar.basics.errors import InputError
 from hilstar.tracker.sensors import Sensor, sensor_named
+from hilstar.tracker.settings import DetectorSettings
 
 SENSOR, DETECTOR = "sensor", "detector"
 EFFICIENCY = "quantum_efficiency"
@@ -16,8 +17,42 @@ DETECTOR_KEYS = ("gain_e_per_dn", "bits", "full_well_e", "read_noise_e", "dark_e
 INSTEAD = {"read_noise_e": "read_noise_table", "dark_e_per_s": "dark_quantiles"}
 # A dark current of the file's own is at the file's own reference temperature.
 DARK, OF_DARK = ("dark_e_per_s", "dark_quantiles"), ("dark_reference_temperature_k", "dsnu_e_per_s")
-# Keys of the detector that are of how it is used, and stay with another sensor.
-OF_USE = ("temperature_k", "device_seed", "noise_version", "solver_image")
+# Keys of the detector that are of its use, its surroundings or the model, and stay with another
+# sensor.
+OF_USE = (
+    "temperature_k",
+    "device_seed",
+    "noise_version",
+    "solver_image",
+    "quantisation_noise",
+    "cosmic_rays_per_cm2_s",
+    "false_stars",
+    "false_star_e_per_s",
+    "false_star_sigma_px",
+)
+# Keys without which a figure of the detector means something else: where a sheet lacks the figure
+# and the bench's stands, they are the bench's, too, as written or by default.
+WITH_FIGURE = {
+    "dark_e_per_s": (
+        "dark_quantiles",
+        "dark_distribution",
+        "dsnu_e_per_s",
+        "dark_reference_temperature_k",
+        "dark_law",
+        "dark_depletion_share",
+        "dark_gap_ev",
+        "dark_activation_ev",
+    ),
+    "read_noise_e": (
+        "read_noise_table",
+        "readout_hz",
+        "read_noise_reference_hz",
+        "read_noise_corner_hz",
+    ),
+}
+# The same of the quantum efficiency: a mosaic has one for each colour.
+WITH_EFFICIENCY = ("bayer", "fill_factor")
+DEFAULTS = DetectorSettings()
 
 
 def with_sensor(tables: dict[str, Any]) -> dict[str, Any]:
@@ -86,9 +121,21 @@ def _asked(sensor: Sensor, missing: list[str]) -> str:
     return f"{text}; write {'it' if len(missing) == 1 else 'them'}"
 
 
-def other_sensor(tables: dict[str, Any], name: str) -> tuple[dict[str, Any], list[str]]:
-    """The tables of a bench file with another sensor in the place of its own, and the keys that
-    stay the file's because the other's sheet lacks them.
+class OtherSensor(NamedTuple):
+    """A bench with another sensor: its tables, and keys of [tracker] and its detector.
+
+    `kept` are figures that the other's sheet lacks and that stay the bench's, `beside` what belongs
+    to them, and `dropped` the keys of the old sensor that nothing replaces.
+    """
+
+    tables: dict[str, Any]
+    kept: list[str]
+    beside: list[str]
+    dropped: list[str]
+
+
+def other_sensor(tables: dict[str, Any], name: str) -> OtherSensor:
+    """A bench file's tables with another sensor in the place of its own.
 
     The optics, the exposure and the detector's temperature stay. Raises InputError as
     `with_sensor` does.
@@ -104,14 +151,41 @@ def other_sensor(tables: dict[str, Any], name: str) -> tuple[dict[str, Any], lis
         gone.add("principal_point_px")
     optics = {key: value for key, value in tracker.items() if key not in gone}
     detector = {key: before[key] for key in OF_USE if key in before}
-    # a mosaic goes with the efficiencies of its colours
-    if EFFICIENCY not in sensor.tracker and "bayer" in before:
-        detector["bayer"] = before["bayer"]
     kept = [key for key in (*EFFICIENCIES, *TRACKER_KEYS[1:]) if key in optics]
-    for key in DETECTOR_KEYS:
-        stated = [other for other in (key, INSTEAD.get(key, key)) if other in before]
-        if key not in sensor.detector and stated:
-            detector[stated[-1]] = before[stated[-1]]
-            kept.append(f"{DETECTOR}.{stated[-1]}")
+    beside: list[str] = []
+    if EFFICIENCY not in sensor.tracker:
+        beside += [key for key in WITH_EFFICIENCY if key in before]
+        detector.update({key: before[key] for key in beside})
+    for figure in DETECTOR_KEYS:
+        stated = _as_stated(figure, before)
+        if figure in sensor.detector or not stated:
+            continue
+        kept.append(f"{DETECTOR}.{list(stated)[-1]}")
+        belonging = _belonging(figure, before)
+        beside += [key for key in belonging if key in before or key in sensor.detector]
+        detector.update(belonging | stated)
+    beside = [key for key in beside if f"{DETECTOR}.{key}" not in kept]
+    replaced = {*detector, *sensor.detector}
+    lost = [key for key in before if key not in replaced]
+    dropped = [key for key in ("principal_point_px",) if key in tracker and key not in optics]
+    dropped += [f"{DETECTOR}.{key}" for key in lost if _matters(key, before)]
     changed = {**optics, SENSOR: sensor.name, DETECTOR: detector}
-    return {**tables, "tracker": changed}, kept
+    of_detector = [f"{DETECTOR}.{key}" for key in beside]
+    return OtherSensor({**tables, "tracker": changed}, kept, of_detector, dropped)
+
+
+def _as_stated(figure: str, detector: dict[str, Any]) -> dict[str, Any]:
+    """A figure of a detector by the keys that state it."""
+    keys = (figure, INSTEAD.get(figure, figure))
+    return {key: detector[key] for key in keys if key in detector}
+
+
+def _belonging(figure: str, detector: dict[str, Any]) -> dict[str, Any]:
+    """What a figure of a detector means something else without, as written or by default."""
+    keys = WITH_FIGURE.get(figure, ())
+    return {key: detector.get(key, getattr(DEFAULTS, key)) for key in keys}
+
+
+def _matters(key: str, detector: dict[str, Any]) -> bool:
+    """Whether a key is more than its default written out."""
+    return bool(detector[key] != getattr(DEFAULTS, key, None))

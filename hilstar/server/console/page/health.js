@@ -5,6 +5,7 @@ import { byId, clock, duration, write } from "./format.js";
 const SILENT_MS = 400; // without a message: with CHECK_MS the page is red within half a second
 const CHECK_MS = 50;
 const SIGNS = { true: "\u2713", false: "!" };
+const LATE = "what is shown is the right sky; its frames come too seldom";
 
 export class Health {
   constructor(link, onChange) {
@@ -25,16 +26,16 @@ export class Health {
     return this.serverMs + performance.now() - this.saidAt;
   }
 
-  // {ok, headline, reasons, since}: what the server says, unless it says nothing.
+  // {ok, late, headline, reasons, since}: what the server says, unless it says nothing.
   judge() {
     const silent = performance.now() - this.saidAt;
-    if (this.said === null) return { ok: false, headline: "Connecting", reasons: this.link.refusedWhy || "no word from hilstar yet", since: null };
+    if (this.said === null) return { ok: false, late: false, headline: "Connecting", reasons: this.link.refusedWhy || "no word from hilstar yet", since: null };
     if (silent > SILENT_MS) {
       const why = this.link.open ? "the connection is open, but hilstar says nothing" : this.link.refusedWhy || "the connection is lost; trying again";
-      return { ok: false, headline: "No word from hilstar", reasons: `${why}. What is below is old.`, since: this.serverMs };
+      return { ok: false, late: false, headline: "No word from hilstar", reasons: `${why}. What is below is old.`, since: this.serverMs };
     }
-    const { ok, since, reasons } = this.said;
-    return { ok, headline: this.session ? (ok ? "First light goes on" : "A step has failed") : ok ? "Sky is right" : "Sky is not right", reasons: reasons.join("; "), since: Date.parse(since) };
+    const { ok, late, headline, since, reasons } = this.said;
+    return { ok, late, headline, reasons: late ? LATE : reasons.join("; "), since: Date.parse(since) };
   }
 
   get wellSaid() {
@@ -46,12 +47,13 @@ export class Health {
 
   check() {
     this.link.check();
-    const { ok, headline, reasons, since } = this.judge();
+    const { ok, late, headline, reasons, since } = this.judge();
     const box = byId("health");
     const silent = headline === "No word from hilstar" || this.said === null;
-    if (ok !== this.ok || box.dataset.silent !== String(silent)) {
+    if (ok !== this.ok || box.dataset.silent !== String(silent) || box.dataset.late !== String(late)) {
       this.ok = ok;
       box.dataset.ok = String(ok);
+      box.dataset.late = document.body.dataset.late = String(late);
       box.dataset.silent = String(silent);
       document.body.dataset.ok = String(ok);
       document.body.dataset.silent = String(silent);

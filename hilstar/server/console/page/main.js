@@ -2,11 +2,12 @@
 
 import { Chart } from "./charts.js";
 import { Controls, listKeys } from "./controls.js";
+import { nameStars, writeFigures } from "./figures.js";
 import { byId, clock, duration, write } from "./format.js";
 import { Health } from "./health.js";
 import { Link } from "./link.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
-import { Rows, addEvent, writeAttitude, writeRefusals, writeRun, writeSource, writeTracker } from "./panels.js";
+import { Rows, addEvent, writeAttitude, writeRefusals, writeTracker } from "./panels.js";
 import { Picture } from "./picture.js";
 import { HISTORY_S, MESSAGE_KEYS } from "./protocol.js";
 import { Sky } from "./sky.js";
@@ -97,8 +98,8 @@ const HEARD = {
     health.hear(said);
     write(byId("utc"), `${clock(said.utc)} UTC`);
     writeAttitude(said.attitude, attitudeRows);
-    writeSource(said, attitudeRows);
-    writeRun(said, runRows);
+    writeFigures("source", said, attitudeRows);
+    writeFigures("run", said, runRows);
     writeRefusals(said.counts.refused);
     if (said.tracker) writeTracker(said.tracker, trackerRows);
     controls.hear(said);
@@ -126,6 +127,7 @@ const HEARD = {
   truth(said) {
     if (held && said.frame !== picture.frame) return; // the truth of the picture that is held stays
     overlays.add(said);
+    nameStars(said.stars);
     redraw("picture");
   },
 };
@@ -146,6 +148,7 @@ async function onPicture(data) {
     const raw = await new Response(stream).arrayBuffer();
     if (held) return;
     picture.show(head.dtype === "u2" ? new Uint16Array(raw) : new Uint8Array(raw), head.w, head.h, head.frame);
+    picture.follow(overlays.of(head.frame));
     pictureAt = performance.now();
     redraw("picture");
   } finally {
@@ -265,7 +268,7 @@ const KEYS = [
   ...OVERLAYS.map(([key, words, , stroke]) => [stroke, `${words}, on or off`, () => overlays.toggle(key)]),
   ["0", "Whole picture", () => picture.view.fit()],
   ["1", "One to one", () => picture.view.setZoom(1)],
-  ["9", "Single pixels at the brightest star", () => picture.showPixels()],
+  ["9", "Single pixels at the brightest star, which is followed", () => picture.showPixels(overlays.of(picture.frame))],
   ["+", "Zoom in", () => picture.view.zoomStep(1)],
   ["-", "Zoom out", () => picture.view.zoomStep(-1)],
   ["h", "Hold the picture on this page", hold],

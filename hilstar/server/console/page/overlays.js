@@ -303,6 +303,8 @@ export function seenStars(truth, picture) {
 export function pictureText(truth, picture, zoom) {
   const named = picture.hasValues ? seenStars(truth, picture).slice(0, 3).join(", ") : "";
   const out = (truth?.stars || []).filter((star) => star[STAR.colour]?.includes("out of gamut")).length;
+  const followed = picture.followed === null ? null : (truth?.stars || []).find((star) => star[STAR.hip] === picture.followed || star[STAR.label] === picture.followed);
+  if (followed) return `frame ${picture.frame}  ${zoom}\u00a0%  follows ${nameOf(followed)}`;
   return `frame ${picture.frame}  ${zoom}\u00a0%${named ? `  ${named}` : ""}${out ? `  ${out} out of gamut` : ""}`;
 }
 

@@ -2,12 +2,14 @@
 // (an average would lose the stars); larger, each pixel is a square, with its value written in it where there is room.
 
 import { byId, write } from "./format.js";
+import { STAR } from "./protocol.js";
 import { PIXELS_ZOOM, View } from "./view.js";
 
 const STRETCH_GAIN = 4; // asinh(gain * level) / asinh(gain * white): the first level of 8 bits has 27 % of the way to white
 const GRID_FROM = 9; // CSS pixels per monitor pixel from which their edges are drawn
 const VALUES_FROM = 22;
 const MAX_RATIO = 2;
+const SAME_STAR_PX = 4; // from the brightest pixel to the place of its star
 const CLIPPED_RED = 0xff4d4dff; // ABGR
 
 const STRETCHES = {
@@ -82,12 +84,19 @@ export function addGlow(pooled, width, height, table, pixels, kernels) {
   }
 }
 
+function identity(star) {
+  return star[STAR.hip] || star[STAR.label] || null;
+}
+
 export class Picture {
   constructor(canvas, onView) {
-    Object.assign(this, { canvas, levels: null, frame: null, white: 255, stretch: "asinh", redClipped: false });
+    Object.assign(this, { canvas, levels: null, frame: null, white: 255, stretch: "asinh", redClipped: false, followed: null });
     this.context = canvas.getContext("2d");
     this.close = document.createElement("canvas");
     this.view = new View(canvas, onView);
+    this.view.onHand = () => {
+      this.followed = null;
+    };
     this.pointer = null;
     for (const kind of ["pointermove", "pointerdown"]) {
       canvas.addEventListener(kind, (event) => this.point(event));
@@ -250,8 +259,8 @@ export class Picture {
     write(byId("pixel"), level === null ? "" : `(${this.pointer[0]}, ${this.pointer[1]}) px: code ${level}`);
   }
 
-  // Close to the brightest pixel of what is seen now.
-  showPixels() {
+  // Close to the brightest pixel of what is seen now, and to its star wherever that moves.
+  showPixels(truth) {
     if (!this.levels) return;
     const [left, top, columns, rows] = this.seen();
     let best = [this.view.cx, this.view.cy];
@@ -265,5 +274,17 @@ export class Picture {
       }
     }
     this.view.setZoom(PIXELS_ZOOM * this.view.ratio, best, true);
+    const away = (star) => Math.hypot(star[STAR.x_px] - best[0], star[STAR.y_px] - best[1]);
+    const near = (truth?.stars || []).filter((star) => away(star) < SAME_STAR_PX);
+    this.followed = near.length ? identity(near[0]) : null; // the brightest comes first
+  }
+
+  // The star that is followed stays in the middle, to whole pixels, so that their edges stand still.
+  follow(truth) {
+    if (this.followed === null || truth?.frame !== this.frame) return;
+    const star = truth.stars.find((one) => identity(one) === this.followed);
+    const place = star ? [Math.round(star[STAR.x_px]), Math.round(star[STAR.y_px])] : [-1, -1];
+    if (this.levelAt(...place) === null) this.followed = null;
+    else this.view.centreOn(place);
   }
 }

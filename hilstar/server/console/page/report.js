@@ -207,6 +207,7 @@ async function show(k, andMove = true) {
   overlays.truths.clear();
   overlays.newest = null;
   if (one.truth) overlays.add({ ...one.truth, frame: one.frame });
+  picture.follow(overlays.of(one.frame));
   write(byId("scrub-text"), [momentText(one.t_s), `picture ${k + 1} of ${run.pictures.length}`, one.why].filter(Boolean).join(" \u00b7 "));
   byId("scrub").setAttribute("aria-valuetext", byId("scrub-text").textContent);
   const badge = byId("picture-badge");
@@ -254,9 +255,10 @@ function capital(text) {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
-function writeHealth({ ok, headline, share, reasons }) {
+function writeHealth({ ok, late, headline, share, reasons }) {
   const box = byId("health");
   box.dataset.ok = document.body.dataset.ok = String(ok);
+  box.dataset.late = document.body.dataset.late = String(late);
   write(byId("health-icon"), ok ? "\u2713" : "!");
   write(byId("health-headline"), headline);
   write(byId("health-reasons"), ok ? "every frame on time, with a fresh attitude" : `${share} of its time was: ${reasons.join("; ")}`);
@@ -330,7 +332,7 @@ function startPicture() {
 const KEYS = {
   0: () => picture.view.fit(),
   1: () => picture.view.setZoom(1),
-  9: () => picture.showPixels(),
+  9: () => picture.showPixels(overlays.of(picture.frame)),
   "+": () => picture.view.zoomStep(1),
   "-": () => picture.view.zoomStep(-1),
   ArrowLeft: () => picture.view.pan(-1, 0),

@@ -4,7 +4,7 @@ import { byId } from "./format.js";
 
 const KEY = "hilstar.theme";
 const ORDER = ["auto", "light", "dark"];
-const WORDS = { auto: "Auto", light: "Light", dark: "Dark" };
+const WORDS = { auto: "Theme: auto", light: "Theme: light", dark: "Theme: dark" };
 const INKS = {
   muted: "--muted", accent: "--accent", bad: "--bad", warn: "--warn", ok: "--ok", gridLine: "--line", axis: "--edge", one: "--series-1", two: "--series-2", three: "--series-3",
   skyGround: "--sky-ground", skyLine: "--sky-line", skyText: "--sky-text", star: "--sky-star", galaxy: "--sky-galaxy", ecliptic: "--sky-ecliptic",
@@ -35,7 +35,6 @@ export function startTheme(onChange, onPrint) {
   const apply = () => {
     document.documentElement.dataset.theme = chosen === "auto" ? (dark.matches ? "dark" : "light") : chosen;
     button.textContent = WORDS[chosen];
-    button.setAttribute("aria-label", `Colours: ${WORDS[chosen]}`);
     readInks();
     onChange();
   };

@@ -7,12 +7,16 @@ const PAN_SHARE = 0.15; // of the view, for one arrow key
 
 export class View {
   constructor(canvas, onChange) {
-    Object.assign(this, { canvas, onChange, w: 16, h: 9, cx: 7.5, cy: 4, zoom: null, ratio: 1, pointers: new Map(), moved: 0 });
+    // `onHand` is told when a person moves the picture: it then follows no star any more
+    Object.assign(this, { canvas, onChange, onHand: () => {}, w: 16, h: 9, cx: 7.5, cy: 4, zoom: null, ratio: 1, pointers: new Map(), moved: 0 });
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => this.release(event));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
-    canvas.addEventListener("dblclick", (event) => this.zoomBy(4, this.at(event)));
+    canvas.addEventListener("dblclick", (event) => {
+      this.onHand();
+      this.zoomBy(4, this.at(event));
+    });
   }
 
   setSize(w, h) {
@@ -51,6 +55,7 @@ export class View {
   }
 
   fit() {
+    this.onHand();
     this.zoom = null;
     this.settle();
   }
@@ -65,6 +70,11 @@ export class View {
     this.settle();
   }
 
+  centreOn([x, y]) {
+    Object.assign(this, { cx: x, cy: y });
+    this.settle();
+  }
+
   zoomBy(factor, about) {
     this.setZoom(this.scale * factor, about);
   }
@@ -74,6 +84,7 @@ export class View {
   }
 
   pan(right, down) {
+    this.onHand();
     this.cx += (right * PAN_SHARE * this.canvas.width) / this.scale;
     this.cy += (down * PAN_SHARE * this.canvas.height) / this.scale;
     this.settle();
@@ -107,6 +118,7 @@ export class View {
     this.pointers.set(event.pointerId, now);
     this.moved += Math.hypot(dx, dy);
     if (this.fitted) return;
+    this.onHand();
     const share = this.ratio / this.scale / this.pointers.size;
     this.cx -= dx * share;
     this.cy -= dy * share;
@@ -130,6 +142,7 @@ export class View {
   wheel(event) {
     if (!event.ctrlKey && this.fitted && document.activeElement !== this.canvas) return;
     event.preventDefault();
+    this.onHand();
     this.zoomBy(Math.exp(-event.deltaY * 0.002), this.at(event));
   }
 }

@@ -35,7 +35,7 @@ from hilstar.server.console.server.connections import (
     ReadingWebSocket,
 )
 from hilstar.server.console.server.reader import TICK_S, PicturePacker, RunReader
-from hilstar.server.console.server.scpi import ScpiServer
+from hilstar.server.console.server.scpi_server import ScpiServer
 
 PR_SET_PDEATHSIG = 1
 NICE = 5  # frames go first

@@ -34,6 +34,7 @@ from hilstar.basics.palette import palette_css
 from hilstar.basics.wrong_sky import ENDS
 from hilstar.server.answers.judge import VERDICTS, TrackerFigures
 from hilstar.server.console.messages import Order, OrderAnswer, RunState, Setup
+from hilstar.server.console.page_figures import metrics_of
 from hilstar.server.console.protocol import (
     CONTROLS,
     SUBPROTOCOL,
@@ -45,6 +46,11 @@ from hilstar.server.console.protocol import (
 from hilstar.server.console.server.connections import OpenPage, OpenPages
 from hilstar.server.console.server.reader import RunReader
 
+# Of metrics that have a value of their own, by the kind that `page_figures` states.
+FAMILIES: dict[str, type[CounterMetricFamily | GaugeMetricFamily]] = {
+    "counter": CounterMetricFamily,
+    "gauge": GaugeMetricFamily,
+}
 LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
 HEADERS = {
     "Cache-Control": "no-store",
@@ -187,39 +193,21 @@ class RunCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics with their current values."""
-        hello, state, health = (
-            self._reader.setup.hello,
-            self._reader.seen or RunState(host_ns=0),
-            self._reader.health,
-        )
+        hello = self._reader.setup.hello
+        state = self._reader.seen or RunState(host_ns=0)
+        health = self._reader.health
+        ledger = state.ledger
+        pacing = self._reader.pacing
         info = {
             key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")
         }
         yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
-        counts, clock, ledger, pacing = state.counts, state.clock, state.ledger, self._reader.pacing
-        age_ms = None if state.attitude is None else state.attitude.age_ms
-        for name, help_text, count in (
-            ("frames", "Frames shown.", counts.frames),
-            ("frames_missed", "Refresh periods without a frame of their own.", counts.missed),
-            ("frames_stale", "Frames shown with a stale attitude.", counts.stale),
-            (
-                "frames_given_up",
-                "Frames given up because their moment had passed.",
-                counts.given_up,
-            ),
-            ("packets_received", "Attitude packets received.", counts.received),
-            (
-                "packets_lost",
-                "Attitude packets that never came, by gaps of their sequence.",
-                counts.lost,
-            ),
-            ("wrong_sky_seconds", "Seconds in which the sky shown was wrong.", state.wrong_sky_s),
-        ):
-            yield CounterMetricFamily(f"hilstar_{name}", help_text, value=count)
+        for metric, value in metrics_of(self._reader.state()):
+            yield FAMILIES[metric.kind](f"hilstar_{metric.name}", metric.help, value=value)
         refused = CounterMetricFamily(
             "hilstar_packets_refused", "Attitude packets refused.", labels=["reason"]
         )
-        for reason, count in counts.refused.items():
+        for reason, count in state.counts.refused.items():
             refused.add_metric([reason], count)
         yield refused
         wrong = GaugeMetricFamily(
@@ -232,63 +220,23 @@ class RunCollector(Collector):
         tracker = state.tracker
         if tracker is not None:
             yield from tracker_metrics(tracker)
-        # in units of the last; None is left out
-        gauges: list[tuple[str, str, float | None, float]] = [
-            ("healthy", "1 while the sky is right, as GET /health has it.", health.ok, 1),
-            ("health_since_timestamp_seconds", "Since when that is so.", health.since_s, 1),
-            ("attitude_missing", "1 until an attitude has come.", state.frame.missing, 1),
-            ("attitude_stale", "1 while the attitude is stale.", state.frame.stale, 1),
-            ("attitude_age_seconds", "Age of the attitude of the newest frame.", age_ms, 1e-3),
-            (
-                "clock_offset_seconds",
-                "Host time minus the sender's.",
-                None if clock is None else clock.offset_ms,
-                1e-3,
-            ),
-            (
-                "clock_uncertainty_seconds",
-                "Of the offset.",
-                None if clock is None else clock.sigma_ms,
-                1e-3,
-            ),
-            (
-                "clock_drift_ratio",
-                "How much faster the sender's clock runs.",
-                None if clock is None else clock.drift_ppm,
-                1e-6,
-            ),
-            ("stars", "Stars in the newest frame.", state.frame.stars, 1),
-            (
-                "stars_clipped",
-                "Those brighter than the monitor's white.",
-                len(state.frame.clipped),
-                1,
-            ),
-            ("display_lost", "1 where the display has gone.", bool(state.display_lost), 1),
+        gauges: list[tuple[str, str, float]] = [
+            ("healthy", "1 while the sky is right, as GET /health has it.", health.ok),
+            ("health_since_timestamp_seconds", "Since when that is so.", health.since_s),
+            ("attitude_missing", "1 until an attitude has come.", state.frame.missing),
+            ("attitude_stale", "1 while the attitude is stale.", state.frame.stale),
+            ("display_lost", "1 where the display has gone.", bool(state.display_lost)),
             (
                 "operator_override",
                 "1 while an operator changes the sky.",
                 bool(state.operator_text),
-                1,
             ),
-            ("ledger_bytes", "Size of the ledger.", None if ledger is None else ledger.bytes, 1),
-            (
-                "ledger_failing",
-                "1 while it cannot be written.",
-                None if ledger is None else bool(ledger.failing),
-                1,
-            ),
-            (
-                "frame_interval_sd_seconds",
-                "Standard deviation of it.",
-                None if pacing is None else pacing.sd_ms,
-                1e-3,
-            ),
-            ("console_clients", "Pages that are open.", self.clients, 1),
+            ("console_clients", "Pages that are open.", self.clients),
         ]
-        for name, help_text, value, unit in gauges:
-            if value is not None:
-                yield GaugeMetricFamily(f"hilstar_{name}", help_text, value=float(value * unit))
+        if ledger is not None:
+            gauges.append(("ledger_failing", "1 while it cannot be written.", bool(ledger.failing)))
+        for name, help_text, gauged in gauges:
+            yield GaugeMetricFamily(f"hilstar_{name}", help_text, value=float(gauged))
         if pacing is not None:
             help_text = "Between frames, over the last minute."
             intervals = GaugeMetricFamily(
@@ -313,8 +261,6 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
     for reason, count in found.refused.items():
         refused.add_metric([reason], count)
     yield refused
-    help_text = "Answers whose stamp is before an earlier answer's."
-    yield CounterMetricFamily("hilstar_tracker_out_of_order", help_text, value=found.out_of_order)
     for name, help_text, values in (
         ("residual", "Of the newest answer.", found.residual_arcsec),
         ("residual_rms", "Of the last minute's right answers.", found.rms_arcsec),
@@ -325,22 +271,11 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
             for axis, value in zip("xyz", values, strict=True):
                 gauge.add_metric([axis], value)
             yield gauge
-    for name, help_text, figure, unit in (
-        (
-            "availability_ratio",
-            "Right answers of the last minute over those due.",
-            found.availability,
-            1,
-        ),
-        ("latency_seconds", "From the exposure's middle to the answer.", found.latency_ms, 1e-3),
-        ("answer_age_seconds", "Since the newest answer.", found.age_s, 1),
-        ("silent", "1 while the tracker does not answer.", bool(found.silent), 1),
-        ("trouble", "1 while something is wrong with the tracker's line.", bool(found.trouble), 1),
+    for name, help_text, trouble in (
+        ("silent", "1 while the tracker does not answer.", found.silent),
+        ("trouble", "1 while something is wrong with the tracker's line.", found.trouble),
     ):
-        if figure is not None:
-            yield GaugeMetricFamily(
-                f"hilstar_tracker_{name}", help_text, value=float(figure * unit)
-            )
+        yield GaugeMetricFamily(f"hilstar_tracker_{name}", help_text, value=float(bool(trouble)))
 
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"

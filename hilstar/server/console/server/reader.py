@@ -21,12 +21,16 @@ from hilstar.display.response import Levels
 from hilstar.server.answers.judge import TrackerFigures
 from hilstar.server.console import messages, protocol
 from hilstar.server.console.overlay import MAX_STARS, OverlayScene
+from hilstar.server.console.page_figures import RunCounts
 
 SILENT_NS = 6 * NS_PER_S // 10  # the run is seen ten times a second
 HUNG_NS = 4 * NS_PER_S // 10
 HUNG_PERIODS = 2.5
 UNASKED_NS = 2 * NS_PER_S  # in lockstep, without a request
 MANY_MISSED_SHARE = 0.5  # share of the last second's frames
+MISSING = "frames are missing"
+HEADLINES = {True: "Sky is right", False: "Sky is not right"}
+SESSION_HEADLINES = {True: "First light goes on", False: "A step has failed"}
 TICK_S = 0.1
 PACING_EACH_S = 1.0
 MIN_INTERVALS = 10
@@ -46,6 +50,36 @@ class RecentFrames:
 
     swap_ns: int = 0
     missed_share: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SkyJudgement:
+    """Why the sky is not right, [] where it is, and that in a few words.
+
+    `late`: frames are missed, and nothing else is wrong: what is shown is the right sky.
+    """
+
+    reasons: list[str]
+    headline: str
+    late: bool = False
+
+
+def judged(
+    seen: messages.RunState | None,
+    now_ns: int,
+    lately: RecentFrames,
+    refresh_hz: float,
+    pace: messages.Pace,
+) -> SkyJudgement:
+    """The judgement on a run now. See `Setup.pace`."""
+    found = reasons(seen, now_ns, lately, refresh_hz, pace)
+    if pace == "session":
+        return SkyJudgement(found, SESSION_HEADLINES[not found])
+    late = len(found) == 1 and found[0].startswith(MISSING)
+    if late:
+        share = f"{lately.missed_share:.0%}".replace("%", " %")
+        return SkyJudgement(found, f"{share} of frames missed in the last second", late)
+    return SkyJudgement(found, HEADLINES[not found])
 
 
 def reasons(
@@ -109,7 +143,7 @@ def _of_rest(seen: messages.RunState, lately: RecentFrames) -> Iterator[str]:
     if seen.faults:
         yield f"a fault is on: {', '.join(seen.faults)}"
     if lately.missed_share > MANY_MISSED_SHARE:
-        yield f"frames are missing: {lately.missed_share:.0%} of the last second's"
+        yield f"{MISSING}: {lately.missed_share:.0%} of the last second's"
 
 
 def _s(time_ns: int) -> str:
@@ -127,14 +161,20 @@ class Health:
     def __init__(self, unix_s: float) -> None:
         self.ok = False
         self.since_s = unix_s
-        self.reasons: list[str] = []
+        self.found = SkyJudgement([], HEADLINES[False])
 
-    def update(self, found: list[str], unix_s: float) -> None:
-        """Set the current reasons."""
-        if (not found) != self.ok:
-            self.ok = not found
+    @property
+    def reasons(self) -> list[str]:
+        """Why the sky is not right, [] where it is."""
+        return self.found.reasons
+
+    def update(self, found: SkyJudgement, unix_s: float) -> None:
+        """Set the current judgement."""
+        right = not found.reasons
+        if right != self.ok:
+            self.ok = right
             self.since_s = unix_s
-        self.reasons = found
+        self.found = found
 
 
 class RunReader:
@@ -154,7 +194,7 @@ class RunReader:
         self._wrong = 0
         self._last: messages.FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
-        self._received: deque[tuple[int, protocol.RunCounts]] = deque()  # over the last second
+        self._received: deque[tuple[int, RunCounts]] = deque()  # over the last second
         self._begun_ns = time.monotonic_ns()
         self.pacing: protocol.Pacing | None = None
         self._pacing_ns = 0
@@ -172,9 +212,8 @@ class RunReader:
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
         lately = RecentFrames(0 if self._last is None else self._last.swap_ns, self._missed_share())
-        self.health.update(
-            reasons(self.seen, now_ns, lately, self.setup.hello.refresh_hz, self.setup.pace), unix_s
-        )
+        refresh_hz = self.setup.hello.refresh_hz
+        self.health.update(judged(self.seen, now_ns, lately, refresh_hz, self.setup.pace), unix_s)
         self._memory.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
         new = []
         for number, data in self._memory.events.after(self._event_at):
@@ -259,9 +298,9 @@ class RunReader:
 
     def health_now(self) -> protocol.SkyHealth:
         """The answer of `GET /health`."""
-        return protocol.SkyHealth(
-            self.health.ok, utc_text(self.health.since_s), self.health.reasons
-        )
+        found = self.health.found
+        since = utc_text(self.health.since_s)
+        return protocol.SkyHealth(self.health.ok, since, found.reasons, found.headline, found.late)
 
     def state(self) -> protocol.PageState:
         """The state of the run, as the page shows it."""

@@ -188,3 +188,9 @@ def test_what_is_wrong_is_refused_by_name_and_line(log, old, new, words):
 def test_a_file_that_ends_before_its_data_is_refused(log, text):
     with pytest.raises(InputError, match=r"the file ends in its (metadata|header); is it cut off"):
         log(text)
+
+
+def test_angles_are_refused_by_their_type_and_not_by_their_count(log):
+    angles = WHOLE.replace("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE")
+    with pytest.raises(InputError, match=r":13: ATTITUDE_TYPE = EULER_ANGLE of a CIC AEM is not"):
+        log(angles.replace(ALNILAM, "10.0 20.0 30.0"))

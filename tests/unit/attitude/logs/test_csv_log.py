@@ -77,10 +77,10 @@ def test_a_row_that_was_cut_off_is_left_out_and_said(log, name, caplog):
 
 
 def test_the_attitude_at_the_end_of_a_cut_log_is_the_last_whole_one(log):
-    result = run_hilstar_here("attitude", log(slew()[:-6]), "--at", "5.8")
+    result = run_hilstar_here("attitude", log(slew()[:-6]), "--time", "5.8")
     assert "RA 84.6371, Dec -1.1999, roll 0.0122 deg" in result.stdout
     assert "the last line has no line end" in result.stderr
-    assert run_hilstar_here("attitude", log(slew()[:-6]), "--at", "5.9").returncode == 2
+    assert run_hilstar_here("attitude", log(slew()[:-6]), "--time", "5.9").returncode == 2
 
 
 def telemetry_text(header, good, bad, lost=LOST):

@@ -101,15 +101,16 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
     assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
     text = (out / "budget.html").read_text()
     titles = [
+        "What the error is made of",
         "Answers over the run",
         "Wrong answers and outages",
-        "Bias",
         "Field-of-view error",
-        "Pixel error",
         "Noise",
+        "Bias",
+        "Pixel error",
         "Clock",
     ]
-    assert re.findall("<h2>(.*?)</h2>", text)[:7] == titles
+    assert re.findall("<h2>(.*?)</h2>", text)[:8] == titles
     # the worst first: the verdict, then availability, wrong answers, lost locks, missed frames
     band = re.search('<div class="health" data-state="(.*?)"><div><strong>(.*?)</strong>', text)
     assert band is not None
@@ -120,9 +121,14 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
     assert figures[1] == ("bad", "5", "wrong answers")
     assert figures[2][2] == "lost locks"
     assert figures[3] == ("ok", "0", "missed frames")
+    # then the error about the bias: field of view, pixel and noise together
+    parts = [found[f"{name}_arcsec"]["cross"] for name in ("fov", "pixel", "noise")]
+    size = re.fullmatch("([0-9.]+) \N{PLUS-MINUS SIGN} [0-9.]+ arcsec", figures[4][1])
+    assert size is not None and float(size[1]) == pytest.approx(np.hypot.reduce(parts), rel=0.02)
+    assert not re.search(r"<td[^>]*>-?[0-9.]+ \(.* to [^a-z]*\)</td>", text)  # none without a unit
     assert "+-" not in text
     assert (
-        text.count("data:image/svg+xml;base64,") == len(drawn) == 3
+        text.count("data:image/svg+xml;base64,") == len(drawn) == 4
         and "prefers-color-scheme: dark" in text
     )
     assert not re.search(r"(src|href)=.(https?:)?//|<td>1</td>", text)
@@ -481,7 +487,12 @@ def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path)
         line,
     )
     assert said is not None and 30 <= int(said[1]) <= 37 and int(said[2]) > 0
-    assert line.split(None, 2)[2] in (tmp_path / "out" / "budget.html").read_text()
+    page = (tmp_path / "out" / "budget.html").read_text()
+    assert line.split(None, 2)[2] in page
+    tile = re.search(
+        r">(\d+)<small>missed frames, [0-9.]+ % of the refresh periods; (\d+) frames were", page
+    )
+    assert tile is not None and tile[1] == said[1] and 0 < int(tile[2]) <= int(said[1])
     assert (
         f"answers left out for held frames,,{said[2]},"
         in (tmp_path / "out" / "budget.csv").read_text()

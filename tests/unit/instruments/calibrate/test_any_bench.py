@@ -38,18 +38,18 @@ from hilstar.instruments.calibrate.first_light.stars import (
     noise_words,
     place_reasons,
 )
-from hilstar.instruments.calibrate.geometric.calibration import (
-    calibrate_seen,
-    nominal_of,
-    rough_geometry,
-    seen_screen_of,
-)
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,
     SeenScreen,
     joined,
     lit_for,
     plan_seen_dots,
+)
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
+    calibrate_seen,
+    nominal_of,
+    rough_geometry,
+    seen_screen_of,
 )
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.instruments.calibrate.scale import StarReading, scale_of
@@ -450,13 +450,13 @@ def test_frames_are_asked_for_where_noise_hides_the_places():
 
 
 @pytest.mark.parametrize(
-    ("high", "advised"), [(2.9, "(--frames 9)"), (28.99, "(--frames 841)"), (60.0, "")]
+    ("high", "advised"), [(2.9, "(--average 9)"), (28.99, "(--average 841)"), (60.0, "")]
 )
 def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
     limit_px = 0.1
     (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
     assert advised in reason
-    assert ("--frames" in reason) == bool(advised)
+    assert ("--average" in reason) == bool(advised)
     assert "a longer [tracker] exposure_s" in reason
 
 

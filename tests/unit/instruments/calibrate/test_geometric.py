@@ -13,13 +13,13 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.calibrate.geometric.calibration import (
+from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots, read_plan, write_plan
+from hilstar.instruments.calibrate.geometric.fit import Nominal
+from hilstar.instruments.calibrate.geometric.geometry_fit import (
     Calibrated,
     calibrate_geometry,
     lines_of,
 )
-from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots, read_plan, write_plan
-from hilstar.instruments.calibrate.geometric.fit import Nominal
 from hilstar.instruments.calibrate.geometric.match import decode
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.optics.camera import Camera, Lens, bounded

@@ -12,7 +12,6 @@ import pytest
 
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.geometric import fit as geometric_fit
-from hilstar.instruments.calibrate.geometric.calibration import nominal_of
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen, lit_for, plan_seen_dots
 from hilstar.instruments.calibrate.geometric.fit import (
     BROWN_CONRADY,
@@ -28,6 +27,7 @@ from hilstar.instruments.calibrate.geometric.fit import (
     noise_of_repeats,
     uncertainty_of,
 )
+from hilstar.instruments.calibrate.geometric.geometry_fit import nominal_of
 from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
 from hilstar.optics.camera import Lens
 from hilstar.server.bench.bench_file import read_bench_file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,20 @@ def test_a_planted_budget_and_what_a_parameter_costs_are_found(table: Path) -> N
     assert len((table.parent / "sensitivity.csv").read_text().splitlines()) == 1 + 3 * 3
     with Image.open(table.parent / "sensitivity_cross.png") as picture:
         assert picture.width > 500 and len(picture.convert("L").getcolors() or range(300)) > 10
+
+
+def test_the_page_has_the_verdict_and_the_cost_of_each_parameter(table: Path) -> None:
+    write_results(table, read_bench_file(write_campaign(table.parent).parent / "bench.toml"), 1)
+    text = (table.parent / "campaign.html").read_text()
+    assert 'data-state="bad"><div><strong>The tracker was right in 98 % of the frames' in text
+    figures = re.findall('<p class="number" data-state=".*?">(.*?)<small>(.*?)</small>', text)
+    assert ("40", "wrong answers") in figures
+    costs_of = [figure for figure in figures if figure[1].startswith("cost of a")]
+    assert len(costs_of) == 3 and all("noise" not in of for _, of in costs_of[:2])
+    assert re.search(r"<td>b</td><td>[0-9.]+ arcsec \(noise\)</td><td>[0-9.]+ arcsec at 0", text)
+    assert "What to do:" in text and "_arcsec" not in text
+    assert re.search(r"<td>bias</td><td>x</td><td>5\.[0-9]+ \(.* to .*\) arcsec</td>", text)
+    assert "<td>availability</td><td></td><td>98 %</td>" in text
 
 
 def test_few_cases_have_no_budget_and_a_note_says_so(tmp_path: Path) -> None:

@@ -450,6 +450,8 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     assert "<strong>Does not conform: " in page
     assert "star&#x27;s place along x" in page and "<td>place_along</td>" not in page
     assert ">-</td>" not in page and ">unlimited</td>" not in page
+    assert "place_along" not in page and "psf_sigma" not in page and "{}" not in page
+    assert "collimator: quaternion cam to mon</th><td>1, 0, 0, 0</td>" in page
     assert run_hilstar_here(*words).returncode == 2
     assert run_hilstar_here(*words, "--check").returncode == 0
     plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6))

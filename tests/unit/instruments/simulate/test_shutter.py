@@ -246,7 +246,7 @@ def test_a_wrong_shutter_is_one_line(tmp_path, keys, said):
         tmp_path / "bench.toml",
         "--radec",
         "84,0,0",
-        "--rate",
+        "--slew",
         "2,0,0",
         "--png",
         tmp_path / "a.png",

@@ -19,6 +19,7 @@ from tools.make_sensors import table
 
 NONE = {"pixel_pitch_um": None, "resolution_px": None, "quantum_efficiency": None}
 DARK = {"dark_e_per_s": 10.0}
+ADC = {"gain_e_per_dn": 20.0, "bits": 12, "full_well_e": 60_000.0}  # of a bench's own sensor
 
 
 def read(folder, tracker, detector):
@@ -86,16 +87,73 @@ def test_tables_without_a_name_are_as_they_were():
     assert with_sensor(tables) is tables
 
 
+def changed(file, name):
+    """The tracker of a bench with another sensor, and what is told of its keys."""
+    other = other_sensor(tomllib.loads(file.text), name)
+    return changed_file(file, other.tables).config.tracker, other
+
+
 def test_another_sensor_takes_the_place_of_the_benchs(tmp_path):
     old = {"read_noise_e": 50.0, "prnu": 0.1, "dark_e_per_s": 7.0, "temperature_k": 270.0}
     file = read(tmp_path, {"principal_point_px": [500.0, 500.0]}, old)
-    tables, kept = other_sensor(tomllib.loads(file.text), "imx252")
-    tracker = changed_file(file, tables).config.tracker
-    assert kept == ["detector.dark_e_per_s"]
+    tracker, other = changed(file, "imx252")
+    assert other.kept == ["detector.dark_e_per_s"]
+    assert other.dropped == ["principal_point_px", "detector.prnu"]
     assert (tracker.detector.read_noise_e, tracker.detector.prnu) == (2.2, 0.0)
     assert (tracker.detector.dark_e_per_s, tracker.detector.temperature_k) == (7.0, 270.0)
     assert (tracker.quantum_efficiency, tracker.principal_point_px) == ("imx252", None)
     assert tracker.aperture_mm == 30
+
+
+def test_a_dark_current_that_stays_has_its_own_temperature_and_law(tmp_path):
+    law = {"dark_law": "e2v-nimo", "dark_reference_temperature_k": 253.0, "dsnu_e_per_s": 3.0}
+    file = read(tmp_path, {}, {"dark_e_per_s": 7.0, "temperature_k": 270.0} | law)
+    before = file.config.tracker.detector
+    tracker, other = changed(file, "imx265")
+    after = tracker.detector
+    rates = [d.dark_e_per_s * d.dark_factor for d in (before, after)]
+    assert rates[0] == rates[1] != 7.0
+    assert after.dsnu_e_per_s == 3.0
+    assert set(other.beside) == {f"detector.{key}" for key in law}
+
+
+def test_a_dark_current_that_stays_is_not_under_the_law_of_the_new_ones_sheet(tmp_path):
+    # the sheet of the CCD47-20 has a law and no figure; the bench's figure is at 320 K by Arrhenius
+    dark = {"dark_e_per_s": 7.0, "dark_reference_temperature_k": 320.0, "read_noise_e": 8.0}
+    file = read(tmp_path, {}, ADC | dark)
+    tracker, other = changed(file, "ccd47-20")
+    assert tracker.detector.dark_factor == file.config.tracker.detector.dark_factor
+    assert set(other.beside) == {"detector.dark_reference_temperature_k", "detector.dark_law"}
+
+
+def test_a_dark_current_of_the_sheet_has_nothing_of_the_benchs_law(tmp_path):
+    law = {"dark_law": "e2v-nimo", "dark_reference_temperature_k": 253.0, "dark_e_per_s": 7.0}
+    tracker, other = changed(read(tmp_path, {}, law), "cmv4000")
+    sheet = DetectorSettings(**sensors()["cmv4000"].detector)
+    assert tracker.detector.dark_factor == sheet.dark_factor
+    assert other.dropped == ["detector.dark_law"]
+
+
+def test_read_noise_goes_with_the_frequency_at_which_it_holds(tmp_path):
+    noise = {
+        "read_noise_e": 8.0,
+        "readout_hz": 4e6,
+        "read_noise_reference_hz": 1e6,
+        "read_noise_corner_hz": 5e4,
+    }
+    file = read(tmp_path, {}, ADC | noise | {"dark_e_per_s": 7.0})
+    stays, other = changed(file, "ccd47-20")
+    assert stays.detector.read_noise_now_e == file.config.tracker.detector.read_noise_now_e
+    assert "detector.readout_hz" in other.beside
+    replaced, other = changed(file, "imx250")
+    assert replaced.detector.read_noise_now_e == 2.2
+    assert {"detector.readout_hz", "detector.read_noise_corner_hz"} <= set(other.dropped)
+
+
+def test_an_efficiency_that_stays_is_that_of_the_open_part_of_a_pixel(tmp_path):
+    file = read(tmp_path, {}, {"fill_factor": 0.5, "dark_e_per_s": 7.0})
+    assert changed(file, "imx265")[0].detector.fill_factor == 0.5
+    assert changed(file, "imx250")[0].detector.fill_factor == 1.0
 
 
 @pytest.mark.parametrize(("aperture_mm", "answer"), [(20, "sensitive enough"), (1, "not enough")])
@@ -111,8 +169,10 @@ def test_a_small_lens_makes_a_sensor_too_insensitive(tmp_path, aperture_mm, answ
 
 
 def test_budget_says_whose_figures_stand(tmp_path):
-    read(tmp_path, {}, DARK)
+    read(tmp_path, {}, DARK | {"dark_reference_temperature_k": 300.0, "prnu": 0.01})
     run = run_hilstar_here("budget", "bench.toml", "--sensor", "imx252", cwd=tmp_path)
     assert "enough: half of the stars of V =" in run.stdout
     assert "Moravian" in run.stderr
-    assert "its sheet has no [tracker.detector] dark_e_per_s: the bench's stand" in run.stderr
+    assert "its sheet has no [tracker.detector] dark_e_per_s: the bench's stand, with" in run.stderr
+    assert "left out, as they are the old sensor's: [tracker.detector] " in run.stderr
+    assert "dark_reference_temperature_k" in run.stderr and "prnu" in run.stderr

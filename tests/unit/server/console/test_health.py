@@ -8,7 +8,13 @@ from msgspec.structs import replace
 from hilstar.server.answers.judge import TrackerFigures
 from hilstar.server.console.messages import RunState
 from hilstar.server.console.protocol import LedgerState, NewestFrame, ShownAttitude, WrongCondition
-from hilstar.server.console.server.reader import Health, RecentFrames, reasons
+from hilstar.server.console.server.reader import (
+    Health,
+    RecentFrames,
+    SkyJudgement,
+    judged,
+    reasons,
+)
 
 S = 1_000_000_000
 NOW = 1_000 * S
@@ -96,11 +102,32 @@ def test_a_session_is_as_well_as_its_steps():
 
 def test_before_the_first_word_nothing_is_right_and_since_is_the_last_change():
     health = Health(5.0)
-    health.update(reasons(None, NOW, LATELY, 60.0, "clock"), 6.0)
-    assert (health.ok, health.since_s, health.reasons) == (False, 5.0, ["the run has not begun"])
-    health.update([], 7.0)
-    health.update([], 8.0)
+    health.update(judged(None, NOW, LATELY, 60.0, "clock"), 6.0)
+    assert (health.ok, health.since_s) == (False, 5.0)
+    assert health.found.reasons == ["the run has not begun"]
+    well = SkyJudgement([], "Sky is right")
+    health.update(well, 7.0)
+    health.update(well, 8.0)
     assert (health.ok, health.since_s) == (True, 7.0)
-    health.update(["stale"], 9.0)
-    health.update(["stale", "hung"], 10.0)
+    health.update(SkyJudgement(["stale"], "Sky is not right"), 9.0)
+    health.update(SkyJudgement(["stale", "hung"], "Sky is not right"), 10.0)
     assert (health.ok, health.since_s) == (False, 9.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "pace", "headline", "late"),
+    [
+        ({}, "clock", "84 % of frames missed in the last second", True),
+        ({"frame": STALE}, "clock", "Sky is not right", False),
+        ({}, "session", "First light goes on", False),
+        ({"failed": ["focus failed"]}, "session", "A step has failed", False),
+    ],
+)
+def test_late_frames_alone_are_no_wrong_sky(changes, pace, headline, late):
+    found = judged(replace(WELL, **changes), NOW, RecentFrames(NOW, 0.84), 60.0, pace)
+    assert (found.headline, found.late) == (headline, late)
+
+
+def test_a_run_that_goes_well_has_its_headline():
+    found = judged(WELL, NOW, RecentFrames(NOW, 0.4), 60.0, "clock")
+    assert (found.headline, found.late, found.reasons) == ("Sky is right", False, [])

@@ -32,7 +32,6 @@ TAKEN_APART = {
     ("health.js", "hear"): PageState,
     ("controls.js", "hear"): PageState,
     ("controls.js", "setUp"): Hello,
-    ("panels.js", "writeRun"): PageState,
     ("overlays.js", "drawAnswer"): Truth,
     ("panels.js", "addEvent"): EventLine,
     ("main.js", "tellFrame"): PageState,

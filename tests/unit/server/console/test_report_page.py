@@ -13,7 +13,7 @@ import pytest
 
 from hilstar.server.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
 from hilstar.server.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
-from hilstar.server.record.report import (
+from hilstar.server.record.run_figures import (
     BLOCK,
     MAX_EVENTS,
     RunFigures,
@@ -167,9 +167,19 @@ def test_the_verdict_names_everything_that_was_wrong():
     assert (
         told["headline"] == "Sky was not right throughout" and told["share"] == "28.5 %"
     )  # 2 of 5 frames and 2 periods without one
+    assert not told["late"]
     well = RunFigures({})
     well.add(frame(0))
     assert verdict(summarise(well), 0)["ok"]
+
+
+def test_a_run_that_missed_frames_alone_was_late_and_right():
+    figures = RunFigures({})
+    figures.add(frame(0))
+    figures.add(frame(1, missed_before=3, missed=3))
+    told = verdict(summarise(figures), 0)
+    assert not told["ok"] and told["late"]
+    assert told["headline"] == "60 % of frames missed"  # 3 of 5 refresh periods
 
 
 def event(k: int, kind: str, since: int | None = None) -> EventRecord:

@@ -20,7 +20,7 @@ from hilstar.server.bench.frame import Bench
 from hilstar.server.console.report import report, run_pictures
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FrameRecord
-from hilstar.server.record.report import RunFigures
+from hilstar.server.record.run_figures import RunFigures
 from tests.support.benches import ORION_Q, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.run_page import levels_of, run_data_of

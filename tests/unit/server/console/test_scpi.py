@@ -20,7 +20,7 @@ from hilstar.server.console.scpi import (
     ScpiError,
     Unit,
 )
-from hilstar.server.console.server.scpi import BARE, COMMANDS, HEADERS, QUERIES
+from hilstar.server.console.server.scpi_server import BARE, COMMANDS, HEADERS, QUERIES
 
 LINES = 6000
 # a line of 4096 bytes takes a millisecond; 0.9 s where digits were tried in every split

@@ -46,7 +46,7 @@ SPANS = 8192  # in which a run is drawn along its time
 BLOCK = 4096  # records that are added at once
 MEGABYTE = 1e6
 WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
-KEYFRAMES = 16
+KEYFRAMES = 16  # drawn in the report, evenly over the run
 MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
 SMALL_RAD = 1e-8
 # newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
@@ -267,7 +267,7 @@ class FrameMarks:
 
 
 def _covered(wrong_sky: WrongSky, swap_ns: npt.NDArray[np.int64]) -> BoolArray:
-    """Which of these moments (n,) of host time had a wrong sky."""
+    """Whether there was a wrong sky at each of these host times (n,)."""
     covered = np.zeros(len(swap_ns), dtype=bool)
     if wrong_sky.any:
         for begin_ns, end_ns in wrong_sky.spans_ns():
@@ -344,9 +344,11 @@ class RunFigures:
             elif not isinstance(record, PacketForm):
                 self._add_one(record)
         accepted = _whole(packets, "accepted")[0] > 0
-        if plain := bool(accepted.all()) and "accepted" in self.packets.counts:
+        # Of packets that are all accepted nothing but their number is counted: all at once.
+        all_at_once = bool(accepted.all()) and "accepted" in self.packets.counts
+        if all_at_once:
             self.packets.count("accepted", len(packets))
-        for record in others if plain else records:
+        for record in others if all_at_once else records:
             self.packets.add(record)
         times_ns, known = _whole(packets, "receive_ns")
         self.packet_times.add(times_ns[known], np.where(accepted, ACCEPTED, REFUSED)[known])
@@ -405,9 +407,10 @@ class RunFigures:
             self.events[kind] = self.events.get(kind, 0) + 1
         record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
         self.wrong_sky.see(kind, record.detail, record.host_ns, record.since_ns)
-        (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(
-            record
-        )
+        if len(self.first_events) < MAX_EVENTS:
+            self.first_events.append(record)
+        else:
+            self.last_events.append(record)
 
     def _add_frames(self, frames: list[FrameRecord]) -> None:
         before = self.last
@@ -417,7 +420,7 @@ class RunFigures:
         self.counted["frames"] += len(frames)
         stale, capped, missed, stars, clipped, below = (_whole(frames, name)[0] for name in NUMBERS)
         blank = np.array([frame.q is None for frame in frames])
-        text_flags = [np.array([getattr(frame, name) != "" for frame in frames]) for name in WORDS]
+        text_flags = [_has_text(frames, name) for name in WORDS]
         swap_ns, _ = _whole(frames, "swap_ns")
         wrong = _covered(self.wrong_sky, swap_ns)
         masks = dict(zip(FAULTS, (stale > 0, blank, *text_flags, wrong), strict=True))
@@ -469,19 +472,23 @@ def _times_ms(
     """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames
     does not count.
     """
-    intervals_ns = np.diff(
-        swap_ns, prepend=swap_ns[0] if before is None else before.swap_ns
-    ).astype(np.float64)
+    swap_before_ns = swap_ns[0] if before is None else before.swap_ns
+    intervals_ns = np.diff(swap_ns, prepend=swap_before_ns).astype(np.float64)
     intervals_ns[after_missed] = np.nan
     if before is None:
         intervals_ns[0] = np.nan
     times_ns = [intervals_ns]
     for name in ("predicted_swap_ns", "draw_ns", "age_ns", "prediction_ns", "receive_ns"):
         ns, known = _whole(frames, name)
-        times_ns.append(
-            np.where(known, ns if name in {"age_ns", "prediction_ns"} else swap_ns - ns, np.nan)
-        )
+        if name not in {"age_ns", "prediction_ns"}:
+            ns = swap_ns - ns
+        times_ns.append(np.where(known, ns, np.nan))
     return np.column_stack(times_ns) / NS_PER_MS
+
+
+def _has_text(frames: Sequence[FrameRecord], name: str) -> BoolArray:
+    """Whether frames (n,) have any text in a column."""
+    return np.array([getattr(frame, name) != "" for frame in frames])
 
 
 def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int64], BoolArray]:

@@ -471,6 +471,13 @@ def write_calibrated(
     geometry = found.fit.geometry
     chosen = found.chosen
     uncertainty = found.uncertainty
+    # -1: no place of the map that the tracker sees
+    map_arcsec: list[list[float]] = []
+    for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0).tolist():
+        map_arcsec.append([round(value, 4) for value in row])
+    modes_arcsec: list[list[float]] = []
+    for mode in uncertainty.modes_arcsec:
+        modes_arcsec.append([float(f"{value:.5g}") for value in mode])
     error = ErrorTable(
         model=chosen.name,
         held_out_rms_arcsec=chosen.rms_arcsec,
@@ -478,13 +485,8 @@ def write_calibrated(
         noise_px=found.problem.noise_px,
         rms_arcsec=uncertainty.rms_arcsec,
         max_arcsec=uncertainty.max_arcsec,
-        map_arcsec=[
-            [round(float(value), 4) for value in row]
-            for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)
-        ],
-        modes_arcsec=[
-            [float(f"{value:.5g}") for value in mode] for mode in uncertainty.modes_arcsec
-        ],
+        map_arcsec=map_arcsec,
+        modes_arcsec=modes_arcsec,
     )
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()

@@ -8,7 +8,6 @@ PSF's variance, times its solid angle. The camera's turn within a frame, which c
 little, is left out.
 """
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -85,13 +84,13 @@ class DiffuseLayer:
                 taken = np.zeros(self._camera.resolution_px[::-1], dtype=bool)
             else:
                 taken = None
-            lit = (
-                self._lit(face, icrs_to_cam, taken if face.is_of_cube else None) for face in near
-            )
-            self._kept = cell, tuple(itertools.chain.from_iterable(lit))
-        maps = self._kept[1]
-        if maps:
-            return replace(light, extended=(*light.extended, *maps))
+            maps: list[LightMap] = []
+            for face in near:
+                maps.extend(self._lit(face, icrs_to_cam, taken if face.is_of_cube else None))
+            self._kept = cell, tuple(maps)
+        _, lights = self._kept
+        if lights:
+            return replace(light, extended=(*light.extended, *lights))
         return light
 
     def line(self) -> str:

@@ -44,11 +44,11 @@ class ExtendedLayer:
         ctx = self._ctx
         regions = []
         sure_tiles = None
-        on_image = [
-            (light, region)
-            for light in lights
-            if (region := light.region(self._resolution_px)) is not None
-        ]
+        on_image = []
+        for light in lights:
+            region = light.region(self._resolution_px)
+            if region is not None:
+                on_image.append((light, region))
         sure = sure if len(on_image) == 1 else None
         fbo.use()
         ctx.enable(moderngl.BLEND)
@@ -67,7 +67,8 @@ class ExtendedLayer:
                 fbo.viewport = (0, 0, *self._resolution_px)
                 fbo.scissor = region
                 self._draw_tiles(light, tiles)
-                fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
+                # as its documentation has it: no test
+                fbo.scissor = None  # type: ignore[assignment]
                 sure_tiles = tiles if sure is not None else None
             else:
                 fbo.viewport = region
@@ -93,9 +94,8 @@ class ExtendedLayer:
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _draw_map(self, light: LightMap) -> None:
-        program, triangle = self._program(
-            "light_map.frag", (), *(() if light.cover is None else ("COVER",))
-        )
+        defines = () if light.cover is None else ("COVER",)
+        program, triangle = self._program("light_map.frag", (), *defines)
         textures = []
         for unit, image in enumerate((light.image, light.cover)):
             if image is not None:
@@ -165,10 +165,9 @@ class ExtendedLayer:
         if cached is None:
             if len(self._textures) >= KEPT_TEXTURES:
                 self._textures.pop(next(iter(self._textures)))[1].release()
-            cached = (
-                owner,
-                self._upload(ray_shifts(owner) if isinstance(owner, Camera) else image, components),
-            )
+            if isinstance(owner, Camera):
+                image = ray_shifts(owner)
+            cached = owner, self._upload(image, components)
         self._textures[id(owner)] = cached  # the last used is the last to go
         return cached[1]
 

@@ -1,0 +1,31 @@
+"""hilstar help: the help of a command."""
+
+from collections.abc import Iterable
+from typing import Annotated
+
+from typer import Argument
+
+from hilstar.cli.completion import offered
+
+
+def commands() -> Iterable[str]:
+    """The commands and groups."""
+    from hilstar.cli.app import names
+
+    return names()
+
+
+def help_(
+    command: Annotated[
+        list[str] | None,
+        Argument(
+            metavar="[COMMAND]...",
+            help="A command, such as frame or calibrate dots; by default all of them.",
+            autocompletion=offered(commands),
+        ),
+    ] = None,
+) -> None:
+    """Show what a command does, and its options, as its --help does."""
+    from hilstar.cli.app import run
+
+    run([*(command or []), "--help"])

@@ -1,0 +1,534 @@
+"""The study of published rigs: what panel, codes, camera and centroider predict of the figures that
+their authors state, and what hilstar's codes would leave on the same panel.
+
+LASSI's rig (Zhao, Lembeck et al. 2024) has the panel and the lens of README's bench. It lights one
+pixel of code 100 a star: the pixel that the star falls into. Its static scatter is that of
+attitudes over five minutes of a display that stands still. It is predicted by exposures of its
+camera with its own two centroiders, and a PSF fit in the place of its network. One figure is not
+stated, how bright a star is; it is taken from the scatter of the Gaussian grid across the
+boresight, and the others follow. Sources stand beside each figure below.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from scipy import ndimage
+
+from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, chart, two_digits, write_records
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.quantise import shown_light
+from hilstar.display.render.reference import linear_image
+from hilstar.instruments.study.row_charts import name_places
+from hilstar.instruments.study.study_benches import (
+    FULL_HD,
+    GLASS,
+    Isolation,
+    Table,
+    lone_windows,
+    squares,
+    star_error,
+    study_bench,
+)
+from hilstar.optics.frame_motion import CameraTurn, swept_sprites
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Scan
+from hilstar.server.bench.code_errors import NO_THRESHOLD
+from hilstar.server.bench.frame import Bench
+from hilstar.sky.catalog import load_catalog
+from hilstar.tracker.centroiders import star_places
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.identify import wahba
+from hilstar.tracker.settings import DetectorSettings
+from hilstar.tracker.star_errors import stamp_errors
+
+LASSI, NAPLES, P13 = "LASSI, Illinois 2024", "Naples 2013", "P13XM015"
+REPOSITORY = "HongruiZhao/CNNStarDetectCentroid, commit 89de519"
+SIMULATOR = f"{REPOSITORY}: starfield_simulator/star_img_sim.py"
+STATIC = f"{REPOSITORY}: post_analysis/attitude_analysis.ipynb; arXiv 2404.19108"
+OUTSIDE = "measured outside hilstar: 233 stars to V 6, twelve attitudes"
+NAPLES_SOURCE = "Rufino et al. 2013, Int. J. of Aerospace Engineering 505720, tables 6 and 11"
+P13_SOURCE = "abstract of the paper on the P13XM015 star simulator"
+# The panel and the lens, SIMULATOR: FEELWORLD F5, 110.690 mm of 1920 pixels, before 350 mm.
+PANEL_PX, PIXEL_MM, LENS_MM = (1920, 1080), 0.05765109021605092, 350.0
+PIXEL_ARCSEC = PIXEL_MM / LENS_MM * ARCSEC_PER_RAD
+FAINTEST_V_MAG = 6.0
+ATTITUDES, SEED = 12, 58
+# The camera behind the panel: main_detection_centroiding.py has its focal length and principal
+# point before this panel, px; the sensor is MT9V022.
+CAMERA_PX, FOCAL_PX, PRINCIPAL_PX = (640, 480), 2686.74091, (343.471001, 225.697237)
+PITCH_UM = 6.0
+# data_generation/sim/star_img_sim.py: full well, bits, the PSF of its lens, and a read noise of the
+# full well over 30 times a number from 0 to 1, whose sigma is a root of twelfths.
+FULL_WELL_E, BITS, PSF_SIGMA_PX = 8500.0, 8, 0.85
+GAIN_E_PER_DN = FULL_WELL_E / (2**BITS - 1)
+READ_NOISE_E = FULL_WELL_E / 30 / math.sqrt(12)
+# star_detection_centroiding.py: a dark frame's mean; main_detection_centroiding.py: 3 DN over the
+# background, areas over 3 px, and 7 x 7 px for the centre of mass.
+DARK_DN, THRESHOLD_DN, MIN_PIXELS, MASS_HALF_PX = 10.0, 3.0, 4, 3
+GRID_HALF_PX, FIT_HALF_PX = 2, 4
+EDGE_PX, MATCHED_PX = 5, 3.0
+# Sigma over five minutes about the boresight and two axes across it, arcsec, STATIC.
+SCATTER_ARCSEC = {
+    "network": (52.55005572, 1.94877399, 4.68926435),
+    "Gaussian grid": (143.73856869, 6.31878699, 13.00288255),
+    "centre of mass": (245.87403888, 7.82633869, 24.36435366),
+}
+FITTED, LIGHT_UNIT = "Gaussian grid", "DN"
+LIGHTS_DN = (34.0, 40.0, 48.0, 60.0, 80.0)
+EXPOSURES, QUICK_EXPOSURES = 300, 40
+# Naples: a panel of 0.641 m of 2560 pixels before 1.3 m (REPOSITORY, old_error_analysis.py); 16
+# stars a solution, 22.48 x 17.02 degrees, 5 and 30 arcsec (NAPLES_SOURCE).
+NAPLES_PIXEL_ARCSEC = 641.0 / 2560 / 1300.0 * ARCSEC_PER_RAD
+NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_ARCSEC = 16, (22.48, 17.02), (30.0, 5.0)
+TRIALS = 2000
+P13_RESOLUTION_ARCSEC, P13_ARCSEC = 3.43, 2.0
+OUTSIDE_PIXEL_ARCSEC, OUTSIDE_CODES_ARCSEC, OUTSIDE_CODES_MAG = 10.30, 0.082, 0.0054
+ISOLATION = Isolation(margin_px=7, max_share=2e-4)
+Places = tuple[FloatArray, FloatArray]
+# Places (x, y) of stars whose coarse columns and rows (n,) were found in an image.
+Finder = Callable[[FloatArray, IntArray, IntArray], Places]
+
+
+@dataclass(frozen=True, slots=True)
+class RigFigure:
+    """A figure of a rig: what is published, what is predicted of it, and the difference.
+
+    `with_hilstar` is the same with hilstar's codes on the same panel. NaN where there is none.
+    """
+
+    rig: str
+    figure: str
+    unit: str
+    published: float
+    predicted: float
+    difference: float
+    with_hilstar: float
+    source: str
+
+
+def rig_figure(
+    rig: str,
+    figure: str,
+    unit: str,
+    published: float,
+    predicted: float,
+    source: str,
+    *,
+    with_hilstar: float = math.nan,
+) -> RigFigure:
+    """A figure with its difference, published less predicted."""
+    difference = published - predicted
+    return RigFigure(rig, figure, unit, published, predicted, difference, with_hilstar, source)
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Predict every figure, and write `rigs.csv` and its chart; a line for each. Raises
+    InputError.
+    """
+    places = place_rows(4 if quick else ATTITUDES)
+    codes_share = places[0].with_hilstar / places[0].predicted
+    rows = [*places, *scatter_rows(quick), *constant_rows(codes_share)]
+    rows += [*naples_rows(), *p13_rows()]
+    write_records(directory / "rigs.csv", rows)
+    draw(directory / "rigs", rows)
+    return [finding_of(rows), *map(line_of, rows)]
+
+
+def attitudes(count: int) -> list[FloatArray]:
+    """Attitudes by chance, evenly over the sky: `count` quaternions q_icrs_to_cam."""
+    rng = np.random.default_rng(SEED)
+    ra = rng.uniform(0.0, 360.0, count)
+    dec = np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, count)))
+    roll = rng.uniform(0.0, 360.0, count)
+    return [from_radec_roll_deg(*each) for each in zip(ra, dec, roll, strict=True)]
+
+
+def place_rows(count: int) -> list[RigFigure]:
+    """What each way leaves of places and light on the panel, over attitudes."""
+    tables: dict[str, Table] = {
+        "tracker": {"resolution_px": (1024, 1024), "transmission": GLASS},
+        "sky": {"faintest_v_mag": FAINTEST_V_MAG},
+        "monitor": {**FULL_HD, "bits": BITS},
+        "collimator": {"focal_length_mm": LENS_MM},
+        "render": {"quantisation": "exact"},
+    }
+    rounded = list[FloatArray]()
+    placed = list[FloatArray]()
+    light = list[float]()
+    with TemporaryDirectory() as folder, study_bench(Path(folder) / "lassi.toml", tables) as bench:
+        for q_icrs_to_cam in attitudes(count):
+            own_pixel, codes, magnitudes = field_errors(bench, q_icrs_to_cam)
+            rounded.append(own_pixel)
+            placed.append(codes)
+            light += magnitudes
+    pixel_arcsec = rms(np.concatenate(rounded, axis=1)) * PIXEL_ARCSEC
+    codes_arcsec = rms(np.concatenate(placed, axis=1)) * PIXEL_ARCSEC
+    mag = rms(np.array(light))
+    unit = "arcsec rms an axis"
+    return [
+        rig_figure(
+            LASSI,
+            "places, one pixel a star",
+            unit,
+            OUTSIDE_PIXEL_ARCSEC,
+            pixel_arcsec,
+            f"{SIMULATOR}; {OUTSIDE}",
+            with_hilstar=codes_arcsec,
+        ),
+        rig_figure(
+            LASSI, "places, hilstar's codes", unit, OUTSIDE_CODES_ARCSEC, codes_arcsec, OUTSIDE
+        ),
+        rig_figure(LASSI, "light, hilstar's codes", "mag rms", OUTSIDE_CODES_MAG, mag, OUTSIDE),
+    ]
+
+
+def field_errors(
+    bench: Bench, q_icrs_to_cam: FloatArray
+) -> tuple[FloatArray, FloatArray, list[float]]:
+    """Of a field's stars: how far the middle of a star's pixel is off (2, n), and of those that
+    stand alone hilstar's codes by a PSF fit (2, m), px; and errors of their light, mag.
+    """
+    turn = CameraTurn(q_icrs_to_cam, np.zeros(3))
+    scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
+    sprites = swept_sprites(bench.stars, turn, scan, bench.camera, bench.psf)
+    places = np.stack([sprites.x_px, sprites.y_px])
+    width, height = bench.camera.resolution_px
+    inside = (np.abs(places[0] - (width - 1) / 2) < width / 2) & (
+        np.abs(places[1] - (height - 1) / 2) < height / 2
+    )
+    own_pixel = np.rint(places[:, inside]) - places[:, inside]
+    shown = shown_light(bench.draw(q_icrs_to_cam).levels, bench.panel)
+    true = linear_image(sprites, bench.camera.resolution_px, bench.psf)
+    light = []
+    windows = []
+    rates = sprites.data["electrons_per_s"]
+    for star, window in lone_windows(
+        sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION
+    ):
+        if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
+            continue  # clips at some places within a pixel
+        light.append(star_error(shown, true, window).flux_mag)
+        windows.append(window)
+    seen = bench.renderer.target.seen
+    lit, wanted = (squares(image, windows) for image in (shown, true))
+    off_px = stamp_errors(
+        lit, wanted, bench.psf.width_px, seen.blur_px, seen.pixel_px, box_share=NO_THRESHOLD
+    )
+    return own_pixel, off_px["fit"], light
+
+
+def rms(values: FloatArray) -> float:
+    """The root of the mean square of all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@dataclass(frozen=True, slots=True)
+class RigField:
+    """Stars that the camera sees on the panel: directions (n, 3) in cam, and their places (2, n) on
+    the detector, px, of each star's own pixel and of the star itself.
+    """
+
+    directions: FloatArray
+    pixel_px: FloatArray
+    true_px: FloatArray
+
+
+def rig_field() -> RigField:
+    """The field of the rig's static run, q = (0, 0, 0, 1): the celestial pole."""
+    stars = load_catalog().brighter_than(FAINTEST_V_MAG)
+    ra, dec = np.radians(stars.ra_deg), np.radians(stars.dec_deg)
+    directions = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    directions = directions[:, directions[2] > 0.9]
+    slopes = directions[:2] / directions[2]
+    panel_px = slopes * LENS_MM / PIXEL_MM + np.array(PANEL_PX)[:, None] / 2
+    on_panel = (np.floor(panel_px) >= 0).all(axis=0)
+    on_panel &= (panel_px < np.array(PANEL_PX)[:, None]).all(axis=0)
+    own_pixel = np.floor(panel_px) + 0.5
+    shown = (own_pixel - np.array(PANEL_PX)[:, None] / 2) * PIXEL_MM / LENS_MM
+    principal = np.array(PRINCIPAL_PX)[:, None]
+    pixel_px = FOCAL_PX * shown + principal
+    true_px = FOCAL_PX * slopes + principal
+    limit = np.array(CAMERA_PX)[:, None] - EDGE_PX
+    seen = on_panel & (pixel_px > EDGE_PX).all(axis=0) & (pixel_px < limit).all(axis=0)
+    return RigField(directions[:, seen].T, pixel_px[:, seen], true_px[:, seen])
+
+
+def centre_of_mass(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
+    """The first moment of the pixels about a star, its background in it, as the rig's."""
+    at = np.arange(-MASS_HALF_PX, MASS_HALF_PX + 1)
+    stamps = stamps_at(image, columns, rows, MASS_HALF_PX)
+    light = stamps.sum(axis=(1, 2))
+    return columns + stamps.sum(axis=1) @ at / light, rows + stamps.sum(axis=2) @ at / light
+
+
+def gaussian_grid(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
+    """Parabolas through logarithms of the pixels of each line, weighted by the pixels, whose
+    coefficients are summed over the lines (Delabie et al. 2014, J. Astronaut. Sci. 61, 60).
+    """
+    stamps = np.maximum(stamps_at(image, columns, rows, GRID_HALF_PX), 1.0)
+    return columns + _vertex(stamps), rows + _vertex(stamps.transpose(0, 2, 1))
+
+
+def _vertex(lines: FloatArray) -> FloatArray:
+    """Where the parabolas (n, lines, pixels) together have their top, px from the middle.
+
+    Each line's coefficients are multiplied by its normal equations' determinant.
+    """
+    half = lines.shape[2] // 2
+    powers = np.arange(-half, half + 1) ** np.arange(3)[:, None]
+    normal = np.einsum("jp,nlp,kp->nljk", powers, lines, powers)
+    right_side = np.einsum("jp,nlp,nlp->nlj", powers, lines, np.log(lines))
+    weight = np.linalg.det(normal)
+    solution = np.linalg.solve(normal, right_side[..., None])[..., 0] * weight[..., None]
+    linear, square = solution[..., 1].sum(axis=1), solution[..., 2].sum(axis=1)
+    top = np.divide(-linear, 2 * square, out=np.zeros_like(linear), where=square < 0)
+    return np.asarray(np.clip(top, -half, half))
+
+
+def psf_fit(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
+    """Least squares of the PSF, the level known: no centroider scatters less by much."""
+    stamps = stamps_at(image, columns, rows, FIT_HALF_PX) - DARK_DN
+    x_px, y_px = star_places(stamps, "fit", (PSF_SIGMA_PX, PSF_SIGMA_PX))
+    return columns + x_px, rows + y_px
+
+
+FINDERS: dict[str, Finder] = {
+    "network": psf_fit,
+    "Gaussian grid": gaussian_grid,
+    "centre of mass": centre_of_mass,
+}
+
+
+def stamps_at(image: FloatArray, columns: IntArray, rows: IntArray, half: int) -> FloatArray:
+    """Squares of pixels (n, side, side) about columns and rows (n,)."""
+    at = np.arange(-half, half + 1)
+    return np.asarray(image[rows[:, None, None] + at[:, None], columns[:, None, None] + at])
+
+
+def found_stars(image: FloatArray) -> tuple[IntArray, IntArray]:
+    """Columns and rows (n,) of the rig's detection: middles of lit areas, rounded down."""
+    labels, count = ndimage.label(image > DARK_DN + THRESHOLD_DN)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    wide = np.flatnonzero(sizes >= MIN_PIXELS)
+    wide = wide[wide > 0]
+    middles = ndimage.center_of_mass(np.ones_like(image), labels, wide)
+    rows, columns = np.floor(np.array(middles).reshape(-1, 2)).astype(np.intp).T
+    width, height = CAMERA_PX
+    inside = (columns >= EDGE_PX) & (columns < width - EDGE_PX)
+    inside &= (rows >= EDGE_PX) & (rows < height - EDGE_PX)
+    return columns[inside], rows[inside]
+
+
+def scatter_arcsec(
+    field: RigField, places_px: FloatArray, star_dn: float, exposures: int
+) -> dict[str, FloatArray]:
+    """Sigma of attitudes about the boresight and across it (3,), by centroider, of stars of a
+    light at places on the detector (2, n).
+    """
+    settings = DetectorSettings(
+        gain_e_per_dn=GAIN_E_PER_DN,
+        full_well_e=FULL_WELL_E,
+        bits=BITS,
+        offset_dn=DARK_DN,
+        read_noise_e=READ_NOISE_E,
+    )
+    detector = Detector(settings, CAMERA_PX, PITCH_UM)
+    psf = GaussianPsf((PSF_SIGMA_PX, PSF_SIGMA_PX))
+    rates = np.full(places_px.shape[1], star_dn * GAIN_E_PER_DN)
+    mean_e = psf.spread(places_px[0], places_px[1], rates, (0, 0, *CAMERA_PX)).astype(np.float64)
+    rng = np.random.default_rng(SEED)
+    turns: dict[str, list[FloatArray]] = {name: [] for name in FINDERS}
+    for _ in range(exposures):
+        image = detector.expose(mean_e, 0.0, rng).astype(np.float64)
+        columns, rows = found_stars(image)
+        for name, finder in FINDERS.items():
+            turn = attitude_error(field, *finder(image, columns, rows))
+            if turn is not None:
+                turns[name].append(turn)
+    return {name: np.std(found, axis=0) for name, found in turns.items()}
+
+
+def attitude_error(field: RigField, x_px: FloatArray, y_px: FloatArray) -> FloatArray | None:
+    """The error of an attitude by centroids: turns about z, x and y (3,), arcsec; None of under
+    three stars.
+
+    Each centroid is the star's that is nearest, within MATCHED_PX of its own pixel.
+    """
+    apart = np.hypot(x_px[:, None] - field.pixel_px[0], y_px[:, None] - field.pixel_px[1])
+    matched = apart.min(axis=1, initial=np.inf) < MATCHED_PX
+    if matched.sum() < 3:
+        return None
+    star = apart[matched].argmin(axis=1)
+    rays = np.stack([x_px[matched], y_px[matched]]) - np.array(PRINCIPAL_PX)[:, None]
+    seen = np.concatenate([rays / FOCAL_PX, np.ones((1, rays.shape[1]))]).T
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    turn = to_matrix(wahba(seen, field.directions[star], np.ones(len(seen))))
+    axis = np.array([turn[1, 0] - turn[0, 1], turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0]])
+    return axis / 2 * ARCSEC_PER_RAD
+
+
+def across_rms(scatter: Sequence[float] | FloatArray) -> float:
+    """The rms of the two axes across the boresight."""
+    return rms(np.asarray(scatter[1:]))
+
+
+def scatter_rows(quick: bool) -> list[RigFigure]:
+    """The rig's static scatters, by one light of a star that is taken from one of them."""
+    exposures = QUICK_EXPOSURES if quick else EXPOSURES
+    field = rig_field()
+    by_light = []
+    for star_dn in LIGHTS_DN:
+        found = scatter_arcsec(field, field.pixel_px, star_dn, exposures)
+        by_light.append(across_rms(found[FITTED]))
+    wanted = across_rms(SCATTER_ARCSEC[FITTED])
+    falling = np.log(by_light)[::-1]
+    light_dn = float(np.exp(np.interp(np.log(wanted), falling, np.log(LIGHTS_DN)[::-1])))
+    before = scatter_arcsec(field, field.pixel_px, light_dn, exposures)
+    after = scatter_arcsec(field, field.true_px, light_dn, exposures)
+    rows = [rig_figure(LASSI, "light of a star (fitted)", LIGHT_UNIT, math.nan, light_dn, "none")]
+    for name, published in SCATTER_ARCSEC.items():
+        for what, size in (("about", lambda scatter: scatter[0]), ("across", across_rms)):
+            figure = f"static scatter {what}, {name}"
+            if (name, what) == (FITTED, "across"):
+                figure += " (fitted)"
+            rows.append(
+                rig_figure(
+                    LASSI,
+                    figure,
+                    "arcsec, sigma",
+                    float(size(published)),
+                    float(size(before[name])),
+                    STATIC,
+                    with_hilstar=float(size(after[name])),
+                )
+            )
+    return rows
+
+
+def constant_rows(codes_share: float) -> list[RigFigure]:
+    """What the panel alone does to an attitude, however often it is measured: nobody states it.
+
+    `codes_share` is the error of hilstar's codes over that of one pixel a star.
+    """
+    count = rig_field().pixel_px.shape[1]
+    sides = np.degrees(2 * np.arctan(np.array(CAMERA_PX) / 2 / FOCAL_PX))
+    turns = pixel_attitudes_arcsec(count, (float(sides[0]), float(sides[1])), PIXEL_ARCSEC)
+    return [
+        rig_figure(
+            LASSI,
+            f"constant error of an attitude, {what}",
+            "arcsec rms",
+            math.nan,
+            predicted,
+            "none",
+            with_hilstar=predicted * codes_share,
+        )
+        for what, predicted in zip(("about", "across"), turns, strict=True)
+    ]
+
+
+def naples_rows() -> list[RigFigure]:
+    """What pixels alone do to attitudes of the tracker's stars."""
+    turns = pixel_attitudes_arcsec(NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_PIXEL_ARCSEC)
+    return [
+        rig_figure(
+            NAPLES,
+            f"precision of tracking {what}",
+            "arcsec",
+            published,
+            predicted,
+            NAPLES_SOURCE,
+        )
+        for what, published, predicted in zip(
+            ("about", "across"), NAPLES_ARCSEC, turns, strict=True
+        )
+    ]
+
+
+def pixel_attitudes_arcsec(
+    stars: int, field_deg: tuple[float, float], pixel_arcsec: float
+) -> tuple[float, float]:
+    """Errors of attitudes by so many stars anywhere in a field, each in the middle of its panel's
+    pixel: rms about the boresight, and of an axis across it.
+    """
+    rng = np.random.default_rng(SEED)
+    half = np.tan(np.radians(field_deg) / 2)
+    turns = []
+    for _ in range(TRIALS):
+        slopes = rng.uniform(-1.0, 1.0, (stars, 2)) * half
+        off = rng.uniform(-0.5, 0.5, (stars, 2)) * pixel_arcsec / ARCSEC_PER_RAD
+        known, seen = (unit_rays(part) for part in (slopes, slopes + off))
+        turn = to_matrix(wahba(seen, known, np.ones(stars)))
+        turns.append((turn[1, 0], turn[2, 1], turn[0, 2]))
+    about, *across = np.sqrt(np.mean(np.square(turns), axis=0)) * ARCSEC_PER_RAD
+    return float(about), rms(np.array(across))
+
+
+def unit_rays(slopes: FloatArray) -> FloatArray:
+    """Unit vectors (n, 3) of slopes (n, 2)."""
+    rays = np.column_stack([slopes, np.ones(len(slopes))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def p13_rows() -> list[RigFigure]:
+    """The largest error along an axis of a star on the pixel that it falls into."""
+    predicted = P13_RESOLUTION_ARCSEC / 2
+    return [
+        rig_figure(P13, "largest error of a place", "arcsec", P13_ARCSEC, predicted, P13_SOURCE)
+    ]
+
+
+def finding_of(rows: Sequence[RigFigure]) -> str:
+    """What each way leaves on one panel."""
+    first = rows[0]
+    return (
+        f"one pixel a star leaves {first.predicted:.1f} arcsec rms an axis on LASSI's"
+        f" panel, and hilstar's codes {two_digits(first.with_hilstar)}"
+    )
+
+
+def line_of(row: RigFigure) -> str:
+    """A row in words."""
+    after = ""
+    if not math.isnan(row.with_hilstar):
+        after = f", with hilstar's codes {two_digits(row.with_hilstar)}"
+    published = "not published"
+    if not math.isnan(row.published):
+        published = f"published {two_digits(row.published)}"
+    predicted = f"predicted {two_digits(row.predicted)} {row.unit}"
+    return f"{row.rig}: {row.figure}: {published}, {predicted}{after}"
+
+
+def draw(path: Path, rows: Sequence[RigFigure]) -> None:
+    """Each figure published, predicted, and with hilstar's codes."""
+    note = (
+        "Static scatter: the same light of a star in all rows. The network is predicted by a PSF"
+        " fit. Light is in mag, all else in arcsec."
+    )
+    finding = finding_of(rows)
+    rows = [row for row in rows if row.unit != LIGHT_UNIT]
+    height_inch = 1.6 + 0.3 * len(rows)
+    places = range(len(rows))
+    with chart(path, finding, note=note, height_inch=height_inch) as (axes,):
+        for place, row in zip(places, rows, strict=True):
+            axes.plot([row.published, row.predicted], [place, place], color=MUTED, lw=1)
+        axes.plot([row.with_hilstar for row in rows], places, "D", color=GREEN, ms=4)
+        axes.plot([row.published for row in rows], places, "o", color=ORANGE, mfc="none")
+        axes.plot([row.predicted for row in rows], places, "o", color=BLUE, ms=4)
+        for label, colour, marker in (
+            ("published", ORANGE, "o"),
+            ("predicted", BLUE, "o"),
+            ("with hilstar's codes", GREEN, "D"),
+        ):
+            axes.plot([], [], marker, color=colour, label=label)
+        axes.set_xscale("log")
+        axes.set_xlabel("arcsec, or mag")
+        name_places(axes, [f"{row.rig.partition(',')[0]}: {row.figure}" for row in rows])
+        axes.grid(visible=False, axis="y")
+        axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.62))

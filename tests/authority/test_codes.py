@@ -1,0 +1,134 @@
+"""What the codes of a star six magnitudes under white leave of its light and its place, by
+integrals that share nothing with hilstar.
+
+A star is the exact integral of a Gaussian over pixels, codes become light by IEC 61966-2-1, and the
+tracker's pixels are error functions, as in test_effort.py. A fit is to first order about the star
+itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.target import Target
+from hilstar.display.response import srgb_response
+from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import pack_sprites
+from tests.authority.test_effort import (
+    HALF_PX,
+    centroids,
+    light_of_codes,
+    seen_by_tracker,
+    true_stamps,
+)
+from tests.support.claims import holds
+
+SIGMA_PX, WHITE_E_PER_S, MAG_UNDER_WHITE = 0.85, 1e6, 6.0
+PHASES, STEP_PX = 32, 2 * HALF_PX + 4
+# a star whose middle pixel, centred, has the light of white has this much more in all
+PEAK_SHARE = (2 * ndtr(0.5 / SIGMA_PX) - 1) ** 2
+RATE_E_PER_S = WHITE_E_PER_S / PEAK_SHARE * 10 ** (-0.4 * MAG_UNDER_WHITE)
+# the usual tracker: its optics spread a monitor's pixel by so much, and its pixels are as wide
+BLUR_PX, TRACKER_PIXEL_PX = 0.62, 1.0
+SEEN_SIGMA_PX = float(np.sqrt(SIGMA_PX**2 + 1 / 6 + BLUR_PX**2))
+# for the slopes of a fit; a hundredth of it changes no digit
+SLOPE_STEP_PX, FIT_ROUNDS = 1e-3, 3
+
+
+def fitted(seen, x, y, phases):
+    """How far from the star itself a least-squares fit of light, x and y finds it (2, n), px."""
+
+    def view(x_px, y_px):
+        stamps = true_stamps(x_px, y_px, SIGMA_PX)
+        return seen_by_tracker(stamps, phases, TRACKER_PIXEL_PX, BLUR_PX)[0].reshape(len(seen), -1)
+
+    step, off = SLOPE_STEP_PX, np.zeros((2, len(seen)))
+    flat = seen.reshape(len(seen), -1)
+    for _ in range(FIT_ROUNDS):
+        x_px, y_px = x + off[0], y + off[1]
+        along_x = (view(x_px + step, y_px) - view(x_px - step, y_px)) / (2 * step)
+        along_y = (view(x_px, y_px + step) - view(x_px, y_px - step)) / (2 * step)
+        design = np.stack([view(x_px, y_px), along_x, along_y], axis=2)
+        terms = [np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(design, flat, strict=True)]
+        light, x_light, y_light = np.transpose(terms)
+        off += np.stack([x_light, y_light]) / light
+    return off
+
+
+@pytest.fixture(scope="module")
+def field():
+    """Columns and rows of the stars' pixels, and where in them they are, x and y, px (n,)."""
+    middles = np.arange(PHASES) * STEP_PX + STEP_PX // 2
+    phases = (np.arange(PHASES) + 0.5) / PHASES - 0.5
+    columns, rows = (grid.ravel() for grid in np.meshgrid(middles, middles))
+    x, y = (grid.ravel() for grid in np.meshgrid(phases, phases))
+    return columns, rows, x, y
+
+
+def shown_light(method, field, frames=1, first=0):
+    """The mean light (n, side, side) of each star's square over frames of the real renderer."""
+    columns, rows, x, y = field
+    side = PHASES * STEP_PX
+    psf = GaussianPsf((SIGMA_PX, SIGMA_PX))
+    target = Target((side, side), psf, srgb_response(8), WHITE_E_PER_S, method)
+    numbers, rates = np.arange(len(x)), np.full(len(x), RATE_E_PER_S)
+    stars = pack_sprites(columns + x, rows + y, rates, numbers, (side, side), psf.footprint_px)
+    near = np.arange(-HALF_PX, HALF_PX + 1)
+    shown = 0.0
+    with Renderer(target) as renderer:
+        for frame in range(first + frames):
+            renderer.draw(stars, frame)
+            if frame >= first:
+                light = light_of_codes(renderer.levels().astype(np.float64), 8, "srgb")
+                shown = (
+                    shown
+                    + light[rows[:, None, None] + near[:, None], columns[:, None, None] + near]
+                )
+    return WHITE_E_PER_S * shown / frames
+
+
+def places_off(shown, field, rng):
+    """By centroider, how far from the stars themselves it finds them (2, n), px."""
+    _, _, x, y = field
+    wanted = RATE_E_PER_S * true_stamps(x, y, SIGMA_PX)
+    at = rng.uniform(-0.5, 0.5, (2, len(x)))  # in the tracker's pixels
+    there, boxes = centroids(wanted, at, TRACKER_PIXEL_PX, BLUR_PX, SEEN_SIGMA_PX, None)
+    here, _ = centroids(shown, at, TRACKER_PIXEL_PX, BLUR_PX, SEEN_SIGMA_PX, boxes)
+    seen, _ = seen_by_tracker(shown, at, TRACKER_PIXEL_PX, BLUR_PX)
+    off_px = {kind: place - there[kind] for kind, place in here.items()}
+    return off_px | {"fit": fitted(seen, x, y, at)}
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("method", ["round", "exact"])
+def test_a_star_six_magnitudes_under_white_keeps_its_light_and_its_place(method, field, rng):
+    """Every one of 32 x 32 phases, on eight bits of sRGB: the worst light, the rms of a
+    centroider's place along an axis, and the worst place of the moment.
+    """
+    holds("mag-under-white", MAG_UNDER_WHITE)
+    shown = shown_light(method, field)
+    holds(f"codes-{method}-light", np.abs(magnitudes_off(shown)).max())
+    off_px = places_off(shown, field, rng)
+    holds(f"codes-{method}-fit", rms(off_px["fit"]))
+    holds(f"codes-{method}-moment", np.hypot(*off_px["moment"]).max())
+    if method == "exact":
+        holds("codes-exact-others", max(rms(off) for off in off_px.values()))
+
+
+def magnitudes_off(shown):
+    """How far each star's light is off, mag (n,)."""
+    return 2.5 * np.log10(shown.sum(axis=(1, 2)) / RATE_E_PER_S)
+
+
+def test_six_frames_of_temporal_make_up_for_each_other(field, rng):
+    """Their mean, from the third frame on: the first of a sequence are no special case."""
+    shown = shown_light("temporal", field, frames=6, first=2)
+    holds("codes-temporal-light", rms(magnitudes_off(shown)))
+    for off in places_off(shown, field, rng).values():
+        holds("codes-temporal-places", rms(off))

@@ -1,0 +1,170 @@
+"""Every figure that README and docs state has a row, a test and an oracle that belong together."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from hilstar.instruments.simulate.star_finder import MATCH_PX
+from hilstar.instruments.study.predictors import JITTER
+from hilstar.instruments.study.sweep import BUSY_SHARE
+from hilstar.server.bench.config.render import (
+    DEFAULT_TOLERANCE_MAG,
+    DEFAULT_TOLERANCE_PX,
+    RenderSettings,
+)
+from tests.support import claims as support
+from tests.support.benches import ROOT
+from tests.support.claims import faults, holds, rows
+from tools import claims as tool
+
+ROW = "star-places"
+
+
+def test_each_figure_its_row_and_its_test_belong_together():
+    assert faults() == []
+
+
+def test_the_readme_has_the_sum_of_the_rows():
+    text = (ROOT / "README.md").read_text()
+    assert "<!-- sum of claims -->Of " in text
+    assert tool.with_sum(text, tool.claims_of()) == text, "run python tools/claims.py"
+
+
+def times(name: str, **columns: str) -> list[dict[str, str]]:
+    """The rows of results/NAME.csv whose columns have these values."""
+    with (ROOT / "results" / f"{name}.csv").open(newline="") as file:
+        found = list(csv.DictReader(file))
+    return [row for row in found if all(row[key] == value for key, value in columns.items())]
+
+
+def test_times_are_those_of_the_results():
+    frame = {"width": "1920", "height": "1080", "stars": "1000", "kind": "whole_frame"}
+    (here,), (card,) = (times(name, **frame, method="hilstar") for name in ("bench", "bench_h100"))
+    holds("frame-1000", float(here["median_ms"]))
+    holds("frame-1000-h100", float(card["median_ms"]))
+    fewest = min(times("scale", axis="packets"), key=lambda row: float(row["at"]))
+    holds("frames-share", float(fewest["time"]))
+
+
+def test_settings_are_those_of_the_code():
+    holds("shake", max(size_arcsec for size_arcsec, _ in JITTER))
+    holds("lost-star", MATCH_PX)
+    holds("busy-share", 100 * BUSY_SHARE)
+    holds("tolerance-mag", DEFAULT_TOLERANCE_MAG)
+    holds("tolerance-px", DEFAULT_TOLERANCE_PX)
+    holds("sprite-sigma", max(RenderSettings().sprite_sigma_px))
+
+
+@pytest.fixture(scope="module")
+def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """README, docs, rows and tests."""
+    folder = tmp_path_factory.mktemp("copy")
+    names = ["README.md", "claims.toml"]
+    for pattern in ("docs/*.md", "tests/**/*.py"):
+        names += [path.relative_to(ROOT).as_posix() for path in ROOT.glob(pattern)]
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
+    return folder
+
+
+@pytest.fixture
+def falsified(whole_copy: Path) -> Iterator[Callable[[str, str, str], Path]]:
+    """The copy with another text for the first of one in a file, which has to have it."""
+    texts: dict[Path, str] = {}
+
+    def change(name: str, before: str, after: str) -> Path:
+        path = whole_copy / name
+        text = texts.setdefault(path, path.read_text())
+        assert before in text
+        path.write_text(text.replace(before, after, 1))
+        return whole_copy
+
+    yield change
+    for path, text in texts.items():
+        path.write_text(text)
+
+
+def test_a_true_copy_has_no_fault(whole_copy):
+    assert faults(whole_copy) == []
+
+
+TEST = rows()[ROW].test.partition("::")[0]
+CALL = 'holds("star-places", error_mas.max())'
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after", "fault"),
+    [
+        ("README.md", "0.007 mas<", "0.006 mas<", "star-places is 0.007 mas, the page has"),
+        ("README.md", "0.007 mas<", "10.007 mas<", "star-places is 0.007 mas, the page has"),
+        ("README.md", "0.007 mas<", "0.007 arcsec<", "star-places is 0.007 mas, the page has"),
+        ("README.md", "claim: star-places", "claim: star-place", "no row of claims.toml is"),
+        ("README.md", "0.2 mas<!-- claim: body-places -->", "0.2 mas", "0.2 mas has no mark"),
+        ("docs/accuracy-speed.md", "\n## ", "\nIt is 0.3 px off.\n\n## ", "0.3 px has no mark"),
+        ("claims.toml", TEST, "tests/authority/test_nothing.py", "does not exist"),
+        ("claims.toml", "test_every_star_is", "test_every_star_was", "does not exist"),
+        ("claims.toml", '["apply_space_motion"]', '["starpm"]', "does not use starpm"),
+        ("claims.toml", 'package = "astropy"', 'package = "galsim"', "does not import galsim"),
+        ("claims.toml", 'oracle = "library"', 'oracle = "hope"', "the oracle is of no known kind"),
+        ("claims.toml", 'value = "0.007"', 'value = "0.07"', "under half of 0.07 mas"),
+        ("claims.toml", 'value = "0.007"', 'value = "0.005"', "out of"),
+        ("claims.toml", "the catalogue; no code", "nothing", "hilstar imports astropy too"),
+        ("claims.toml", 'name = "limits"', 'name = "limit"', "no row of the table limits"),
+        ("claims.toml", '"FRAME_ARCSEC"', '"SPIN_ARCSEC"', "does not use SPIN_ARCSEC"),
+        (TEST, CALL, "assert error_mas.max() < 1.0", "does not hand a value to holds"),
+        (TEST, CALL, f"{CALL}\n    assert error_mas.max() < 1.0", "has a bound of its own"),
+        (TEST, CALL, 'holds("star-places", 0.005)', "hands a constant to holds"),
+        (TEST, ".apply_space_motion(", ".moved(", "does not use apply_space_motion"),
+    ],
+)
+def test_what_is_falsified_is_found(falsified, name, before, after, fault):
+    found = faults(falsified(name, before, after))
+    assert any(fault in one for one in found), found
+
+
+def test_too_few_oracles_outside_are_found(falsified):
+    text = (ROOT / "claims.toml").read_text()
+    inside = text.replace('oracle = "closed form"', 'oracle = "own derivation"')
+    found = faults(falsified("claims.toml", text, inside))
+    assert any("figures have an outside oracle" in one for one in found)
+
+
+def test_a_measured_value_has_to_leave_the_figure_true():
+    low, high = rows()[ROW].bound()
+    holds(ROW, high)
+    with pytest.raises(
+        AssertionError, match=r"star-places: measured 0\.008; the pages say at most"
+    ):
+        holds(ROW, 0.008)
+    assert low == float("-inf")
+    about = rows()["codes-round-light"]
+    assert about.bound() == pytest.approx((0.0935, 0.0945))
+    with pytest.raises(AssertionError):
+        holds(about.id, 0.093)
+    with pytest.raises(AssertionError):
+        holds(ROW, float("nan"))
+
+
+def test_values_of_a_run_become_the_last_ones(tmp_path, monkeypatch):
+    records = tmp_path / "records.jsonl"
+    monkeypatch.setenv(support.RECORDS, str(records))
+    for value in (0.0061, 0.0064, 0.0012):
+        holds(ROW, value)
+    monkeypatch.delenv(support.RECORDS)
+    lines = [json.loads(line) for line in records.read_text().splitlines()]
+    today = datetime.date(2031, 2, 3)
+    before = (ROOT / "claims.toml").read_text()
+    after = tool.renewed(before, lines, today)
+    (tmp_path / "claims.toml").write_text(after)
+    changed = [one for one in tool.claims_of(tmp_path) if one != rows()[one.id]]
+    assert [one.id for one in changed] == [ROW]
+    assert (changed[0].last, changed[0].date) == (0.0064, today)
+    assert changed[0].version == lines[0]["version"] != ""

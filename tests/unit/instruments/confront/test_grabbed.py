@@ -1,0 +1,109 @@
+"""confront with photographs that it takes itself: by a command, and by a camera."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from PIL import Image
+
+from hilstar.instruments.confront import page
+from hilstar.instruments.confront.images import read_photographs
+from hilstar.server.genicam.camera import has_aravis
+from hilstar.server.gige.registers import CameraSettings
+from tests.support.commands import run_hilstar_here
+from tests.support.gige_cameras import fake_camera, running_camera
+from tests.support.planted_sky import HEIGHT, SKY, WIDTH, Planted, photograph, write_bench
+
+needs_aravis = pytest.mark.skipif(
+    not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8, python3-gi)"
+)
+AT = ("--at", "2020-01-01T00:00:00")  # of the planted stars' places
+RESULT = ("focal_length_px", "gain_e_per_dn", "distortion")
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory):
+    """A folder with a guess of a camera and one of its photographs, and the camera by it."""
+    folder = tmp_path_factory.mktemp("planted")
+    image = photograph(Planted(), SKY.pointings[1], np.random.default_rng(5))
+    Image.fromarray(image).save(folder / "sky.png")
+    write_bench(folder / "guess.toml")
+    return folder, image, confronted(folder, folder / "sky.png", "-o", folder / "by_file", *AT)
+
+
+def confronted(folder, *words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "_charts", lambda *given: [])
+        done = run_hilstar_here("confront", folder / "guess.toml", *words, "--json")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@needs_aravis
+def test_a_cameras_photograph_gives_what_its_file_gives(planted, tmp_path):
+    folder, image, by_file = planted
+    settings = CameraSettings(WIDTH, HEIGHT, 16, 0.05, 10.0)
+    with running_camera(settings, lambda k: image) as address:
+        before_ns = time.time_ns()
+        found = confronted(
+            folder, "--grab", f"genicam:{address}", "--count", "1", "-o", tmp_path, *AT
+        )
+        after_ns = time.time_ns()
+    (path,) = (tmp_path / "images").iterdir()
+    np.testing.assert_array_equal(fits.getdata(path), image)
+    (photo,) = read_photographs(path, (WIDTH, HEIGHT))
+    assert photo.exposure_s == pytest.approx(0.2)
+    # The camera of this test exposes nothing: its image comes an exposure too early.
+    assert before_ns < photo.t_ns + 100_000_000 < after_ns
+    assert found["camera"] == by_file["camera"]
+
+
+def test_a_command_takes_photographs_too(planted, tmp_path):
+    folder, _, by_file = planted
+    script = tmp_path / "grab.py"
+    script.write_text(
+        "import shutil, sys\n"
+        "assert float(sys.argv[2]) == 0.25\n"
+        f"shutil.copy({str(folder / 'sky.png')!r}, sys.argv[1])\n"
+    )
+    grab = f"{sys.executable} {script} {{output}} {{exposure_s}}"
+    words = ("--grab", grab, "--exposure", "0.25", "--count", "1")
+    found = confronted(folder, *words, "-o", tmp_path / "out", *AT)
+    assert found["camera"] == by_file["camera"]
+
+
+@needs_aravis
+def test_a_camera_that_sees_no_stars_is_told_in_one_line(tmp_path):
+    bench = write_bench(tmp_path / "guess.toml")
+    bench.write_text(bench.read_text().replace(f"[{WIDTH}, {HEIGHT}]", "[512, 512]"))
+    with fake_camera() as address:
+        done = run_hilstar_here(
+            "confront", bench, "--grab", f"genicam:{address}", "--count", "1", "-o", tmp_path / "o"
+        )
+    assert done.returncode == 2
+    assert "hilstar: " in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "no image; give files, or --grab"),
+        (("--count", "3"), "--count: is for --grab"),
+        (("sky.png", "--grab", "genicam:"), "sky.png: --grab takes the images"),
+        (("--grab", "cp a b"), "has no {output}"),
+        (("--grab", "cp {pattern} {output}"), "has {pattern}, and nothing is shown here"),
+        (("--grab", "cp a {output}", "--exposure", "1"), "--grab has no {exposure_s}"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(planted, tmp_path, words, says):
+    folder, _, _ = planted
+    words = [str(folder / word) if word == "sky.png" else word for word in words]
+    done = run_hilstar_here("confront", folder / "guess.toml", *words, "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert says in done.stderr and done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()

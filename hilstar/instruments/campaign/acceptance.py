@@ -135,13 +135,16 @@ class Acceptance:
             if case_set.refused:
                 continue
             sweep = case_set.sweep
-            start = None if sweep is None else sweep.start
-            campaign = self.campaign(case_set, self.directory / case_set.name, start)
-            cases = campaign.cases * (1 if sweep is None else sweep.levels)
+            # the middle of a sweep costs something between its ends
+            levels = (None,) if sweep is None else (sweep.start, sweep.stop)
+            folder = self.directory / case_set.name
+            campaigns = [self.campaign(case_set, folder, level) for level in levels]
+            cases = campaigns[0].cases * (1 if sweep is None else sweep.levels)
             if self.on_bench:
-                yield CostOfSet(case_set, cases, cases * campaign.plan.limit_s)
+                yield CostOfSet(case_set, cases, cases * campaigns[0].plan.limit_s)
                 continue
-            yield CostOfSet(case_set, cases, cases * _case_s(campaign) / min(workers, cases))
+            case_s = sum(_case_s(campaign) for campaign in campaigns) / len(campaigns)
+            yield CostOfSet(case_set, cases, cases * case_s / min(workers, cases))
 
     def run(self, run_cases: RunCases) -> list[SetResult]:
         """Run what is missing of each set, in the plan's order."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from hilstar.attitude.wire.keys import CurveKeys
-from hilstar.attitude.wire.links import LockstepLink, StreamLink
+from hilstar.attitude.wire.links import LockstepLink, PacketDecoder, StreamLink
 from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeReply, TimeRequest
 from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
@@ -19,7 +19,7 @@ from hilstar.attitude.wire.vizard import (
     VizardLive,
     vizard_broadcast,
 )
-from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqApart, ZmqLockstep, ZmqReceiver
+from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqLockstep, ZmqReceiver
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_MS

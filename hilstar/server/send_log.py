@@ -54,7 +54,7 @@ class BadCable:
     """Passes packets on; each meets at most one fault."""
 
     def __init__(
-        self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]
+        self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], object]
     ) -> None:
         self.tally = SendTally()
         self._faults = faults

@@ -114,6 +114,7 @@ def test_a_star_six_magnitudes_under_white_keeps_its_light_and_its_place(method,
     holds("mag-under-white", MAG_UNDER_WHITE)
     shown = shown_light(method, field)
     holds(f"codes-{method}-light", np.abs(magnitudes_off(shown)).max())
+    holds(f"codes-{method}-ripple", np.ptp(magnitudes_off(shown)))
     off_px = places_off(shown, field, rng)
     holds(f"codes-{method}-fit", rms(off_px["fit"]))
     holds(f"codes-{method}-moment", np.hypot(*off_px["moment"]).max())

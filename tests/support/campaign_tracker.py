@@ -49,6 +49,9 @@ class Planted:
     drift_arcsec_s: float = 0.0
     dim_mag_s: float = 0.0
     blind: tuple[int, ...] = ()  # cases in which it never has an attitude
+    # it tells its rate where that has a bias, about x, y, z; its stamps are late by so much
+    rate_bias_deg_s: tuple[float, float, float] | None = None
+    stamp_bias_s: float = 0.0
     seed: int = 1
 
 
@@ -109,7 +112,8 @@ def main() -> None:
             )
         )
         found, at_s = seen(planted, middle_ns, known), (middle_ns - begun_ns) / 1e9
-        told: dict[str, object] = {"t_ns": middle_ns, "q": [1.0, 0.0, 0.0, 0.0], "valid": False}
+        stamp_ns = middle_ns + round(planted.stamp_bias_s * 1e9)
+        told: dict[str, object] = {"t_ns": stamp_ns, "q": [1.0, 0.0, 0.0, 0.0], "valid": False}
         if found is not None and found[0] not in planted.blind:
             turn = from_rotation_vector(error_arcsec(planted, found[1], at_s, rng) / ARCSEC_PER_RAD)
             if rng.random() < planted.wild:
@@ -117,6 +121,9 @@ def main() -> None:
                 wild.append(found[0])
             dn = 1000.0 * 10 ** (-0.4 * planted.dim_mag_s * at_s)
             told |= {"q": multiply(turn, found[1]).tolist(), "valid": True, "stars": 7}
+            if planted.rate_bias_deg_s is not None:
+                rate = np.array(known[-1]["rate_cam_rad_s"]) + np.radians(planted.rate_bias_deg_s)
+                told["rate"] = rate.tolist()
             told["centroids"] = [[100.0 + 50 * star, 200.0, dn * (1 + star)] for star in range(7)]
         line.sendto(json.dumps(told).encode(), ("127.0.0.1", planted.port))
         k = max(k, int((time.monotonic_ns() - begun_ns) / 1e9 * planted.answer_hz))

@@ -30,7 +30,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from hilstar.attitude.wire.links import LinkCounts, RawMessage
+from hilstar.attitude.wire.roads import LinkCounts, RawMessage
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, HostClock
 from hilstar.basics.units import NS_PER_S
@@ -56,7 +56,9 @@ ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its 
 class RawLink(Protocol):
     """What the other process reads: messages as they arrive, not decoded."""
 
-    link_counts: LinkCounts
+    @property
+    def link_counts(self) -> LinkCounts:
+        """What it counts."""
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """Whether something waits."""

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import NoReturn
 
 from hilstar.attitude.wire.apart import RawLink, ReadOrder, Record, pack
-from hilstar.attitude.wire.links import LinkCounts, RawMessage
+from hilstar.attitude.wire.roads import LinkCounts, RawMessage, is_readable, read_device
 from hilstar.basics.errors import HilstarError, one_line
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import ENDING, end_with_parent
@@ -23,7 +23,6 @@ from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock, PromptWhile
 
 WANTED_BUFFER_BYTES = 1 << 20  # for some hundred unread messages; the kernel may give less
 MAX_ORDER_BYTES = 65_536
-MAX_READ_BYTES = 65_536
 LIFE_S = 0.1
 POLL_MS = 20
 
@@ -79,18 +78,10 @@ class _OpenDevice:
         self._clock = clock
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        return bool(select.select([self._file], [], [], timeout_ms / 1000)[0])
+        return is_readable(self._file, timeout_ms)
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
-        if not self.wait_for_message(timeout_ms):
-            return []
-        try:
-            chunk = os.read(self._file, MAX_READ_BYTES)
-        except BlockingIOError:
-            return []
-        if not chunk:
-            raise OSError(0, "it was readable, and nothing came")
-        return [RawMessage(self._clock.now_ns(), [chunk])]
+        return read_device(self._file, timeout_ms, self._clock)
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

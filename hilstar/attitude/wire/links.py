@@ -1,5 +1,4 @@
-"""The contract of every link into hilstar: what it can do, messages with their time of arrival,
-limits against floods.
+"""The contract of every link into hilstar: a road, what its bytes mean, and limits against floods.
 
 A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the
 `AttitudeSample` in it.
@@ -8,13 +7,21 @@ A packet has two names on its way in: what arrived (`RawMessage`, once decoded `
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, astuple, dataclass
-from operator import add, sub
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
 
-from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, Status
-from hilstar.attitude.wire.source import PACKETS, Conventions
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    Event,
+    Packet,
+    Refusal,
+    Status,
+    declares_discontinuity,
+    decode,
+)
+from hilstar.attitude.wire.roads import PAUSE_S, ByteRoad, LinkCounts, RawMessage
+from hilstar.attitude.wire.source import AS_SENT, PACKETS, Conventions, SentAttitudes
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
@@ -25,39 +32,9 @@ if TYPE_CHECKING:
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
 MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
-PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
 OVER_NS = NS_PER_S  # a flood is over once no packet was dropped for this long
 MAX_LOOKED_AT = 1000  # passed-over packets searched for a discontinuity, which is declared once
-CLIENT_REJECTED = "client-rejected"  # the notice that a connection to a socket that binds was none
-WRONG_PEER = "link-rejected"  # the notice that something else than a sender is at the other side
 E_co = TypeVar("E_co", bound=Event, covariant=True)
-
-
-@dataclass(slots=True)
-class LinkCounts:
-    """The counts of a link's connections and messages.
-
-    `connections`: made. `rejected`: failed handshakes, and datagrams of senders that are not
-    allowed. `refused`: too many at once. `lost`: ended, on the side that connects. `resets`: of the
-    link, for memory or for messages without end. `flooded`: messages dropped unread.
-    """
-
-    connections: int = 0
-    rejected: int = 0
-    refused: int = 0
-    lost: int = 0
-    resets: int = 0
-    flooded: int = 0
-
-    def summary(self) -> dict[str, int]:
-        """The counts by name."""
-        return asdict(self)
-
-    def __add__(self, other: LinkCounts) -> LinkCounts:
-        return LinkCounts(*map(add, astuple(self), astuple(other)))
-
-    def __sub__(self, other: LinkCounts) -> LinkCounts:
-        return LinkCounts(*map(sub, astuple(self), astuple(other)))
 
 
 class FloodGate:
@@ -106,25 +83,6 @@ class FloodGate:
         return waiting[passed_over:]
 
 
-class RawMessage(NamedTuple):
-    """What arrived, before it is decoded: host time in ns, its parts, and who sent it, where a link
-    has several senders.
-
-    `empty_ns` is when nothing waited last. A `timely` message woke its reader and did not wait.
-    """
-
-    host_ns: int
-    parts: Sequence[bytes]
-    empty_ns: int = 0
-    timely: bool = True
-    sender: tuple[Any, ...] | None = None
-
-    @property
-    def waited_ns(self) -> int:
-        """How long it may have waited before it was stamped, ns."""
-        return 0 if self.timely else self.host_ns - self.empty_ns
-
-
 @dataclass(frozen=True, slots=True)
 class Arrival(Generic[E_co]):
     """What arrived: host time, what it says, its bytes as received, and how long it may have waited
@@ -159,8 +117,67 @@ class TrackerCamera:
 Pictures = Callable[[AttitudeSample], bytes]
 
 
+class Decoder:
+    """What the bytes of a road mean: which of them are a message, and what each says.
+
+    `conventions` are those of its numbers. `stamped`: messages carry their own times of arrival.
+    """
+
+    stamped: ClassVar[bool] = False
+    conventions: Conventions = PACKETS
+
+    def begin(self) -> None:
+        """Forget the beginning of a message: the road was opened anew."""
+
+    def whole(self, chunk: RawMessage) -> list[RawMessage]:
+        """The messages that a chunk completes, in order."""
+        return [chunk]
+
+    def declares_discontinuity(self, message: bytes) -> bool:
+        """Whether a message says that no attitude is to be interpolated across it."""
+        return False
+
+    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
+        """What whole messages say."""
+        return [self._arrival(message) for message in messages]
+
+    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+        raw = message.parts[-1]
+        return Arrival(message.host_ns, self.event(raw), raw, message.waited_ns)
+
+    def event(self, message: bytes) -> Event:
+        """What a whole message says, or why it says nothing."""
+        raise NotImplementedError
+
+
+def pieces(chunk: RawMessage, messages: list[bytes]) -> list[RawMessage]:
+    """The messages that a chunk completed, each with its stamp: those before the last were there
+    earlier, and waited for it.
+    """
+    return [
+        chunk._replace(parts=[message], timely=chunk.timely and k == len(messages))
+        for k, message in enumerate(messages, 1)
+    ]
+
+
+class PacketDecoder(Decoder):
+    """Packets or JSON, whole as they come, of which only the last part counts."""
+
+    def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
+        self.conventions = sent.conventions
+        self._decode = sent.decoder(decode)
+
+    def declares_discontinuity(self, message: bytes) -> bool:
+        """See `Decoder.declares_discontinuity`."""
+        return declares_discontinuity(message)
+
+    def event(self, message: bytes) -> Event:
+        """See `Decoder.event`."""
+        return self._decode(message)
+
+
 class Link(Closing, ABC):
-    """A link into hilstar, closed when its `with` ends.
+    """A road into hilstar and what its messages mean, closed when its `with` ends.
 
     `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions`
     what its numbers mean. `steps`: its simulation waits for a frame after each attitude (lockstep).
@@ -170,65 +187,109 @@ class Link(Closing, ABC):
 
     steps: ClassVar[bool]
     two_way: bool = False
-    stamped: bool = False
     asks_for_pictures: ClassVar[bool] = False
-    verb: str
-    endpoint: str
-    conventions: Conventions = PACKETS
 
-    def __init__(self, notices: Notices | None, clock: HostClock) -> None:
-        self._notices = Notices() if notices is None else notices
-        self._clock = clock
-        self.link_counts = LinkCounts()
-        self._gate = FloodGate(self.link_counts, self._notices, clock)
+    def __init__(self, road: ByteRoad, conventions: Conventions) -> None:
+        self._road = road
+        self.conventions = conventions
+        self._notices = road.notices
+        self._clock = road.clock
 
-    @abstractmethod
-    def close(self) -> None:
-        """Close the link."""
+    @property
+    def verb(self) -> str:
+        """What the road does with its endpoint, for a person."""
+        return self._road.verb
+
+    @property
+    def endpoint(self) -> str:
+        """Where the road is."""
+        return self._road.endpoint
+
+    @property
+    def link_counts(self) -> LinkCounts:
+        """What the road counts."""
+        return self._road.link_counts
+
+    @property
+    def stamped(self) -> bool:
+        """Whether times of arrival do not wait for this process."""
+        return self._road.stamped
 
     @property
     def trouble(self) -> str:
         """Why the other side gives no messages, as far as that shows: a line; "" where it does
         not.
         """
-        counts = self.link_counts
-        wrong_peer = self._notices.latest(WRONG_PEER)
-        if wrong_peer:
-            return "" if counts.connections else wrong_peer
-        # who binds counts connections from their begin on, so also those that it then rejects
-        is_alone = counts.connections <= counts.rejected
-        if is_alone:
-            return self._notices.latest(CLIENT_REJECTED)
-        return ""
+        return self._road.trouble
 
     def await_ready(self) -> None:
-        """Wait until a sender is heard from the first read on: for a process that reads, and not
-        for long.
+        """See `ByteRoad.await_ready`."""
+        self._road.await_ready()
+
+    def close(self) -> None:
+        """Close the link."""
+        self._road.close()
+
+
+class MessageLink(Link):
+    """A link whose messages are put together again from what its road brings."""
+
+    def __init__(self, road: ByteRoad, decoder: Decoder) -> None:
+        super().__init__(road, decoder.conventions)
+        self._decoder = decoder
+        self._opening = road.openings
+
+    @property
+    def stamped(self) -> bool:
+        """See `Link.stamped`."""
+        return self._road.stamped or self._decoder.stamped
+
+    def messages(self, timeout_ms: int) -> list[RawMessage]:
+        """The whole messages so far, oldest first; waits at most `timeout_ms` for the first
+        bytes.
         """
+        whole: list[RawMessage] = []
+        for chunk in self._road.taken(timeout_ms):
+            whole += self._decoder.whole(chunk)
+        if self._road.openings != self._opening:
+            again = self._opening > 0
+            self._opening = self._road.openings
+            if again:
+                self._begin()
+        return whole
+
+    def _begin(self) -> None:
+        """The road was opened anew."""
+        self._decoder.begin()
 
 
-class StreamLink(Link):
+class StreamLink(MessageLink):
     """A link whose sender runs freely."""
 
     steps: ClassVar[Literal[False]] = False
-    bound: bool = False  # ZeroMQ's, to which any number of senders connect: none of them comes back
+
+    def __init__(self, road: ByteRoad, decoder: Decoder) -> None:
+        super().__init__(road, decoder)
+        self._gate = FloodGate(road.link_counts, road.notices, road.clock)
 
     @property
     def reconnects(self) -> int:
         """How often the sender came back."""
-        if self.bound:
-            return 0
-        return max(0, self.link_counts.connections - 1)
+        return self._road.reconnects
 
-    @abstractmethod
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The messages so far, oldest first; waits at most `timeout_ms` for the first. A lost
-        peer raises nothing.
+        """The messages so far, oldest first, and only the newest of a flood; waits at most
+        `timeout_ms` for the first. A lost peer raises nothing.
         """
+        return self._decoder.arrivals(self.taken(timeout_ms))
 
-    @abstractmethod
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The same, not decoded."""
+        return self._gate.newest(self.messages(timeout_ms), self._decoder.declares_discontinuity)
+
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once something unread has arrived."""
+        return self._road.wait_for_message(timeout_ms)
 
     def send(self, packet: Packet) -> None:
         """Send to the other side, never waiting; lost if there is no listener."""

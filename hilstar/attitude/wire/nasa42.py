@@ -14,20 +14,25 @@ Laws:
 hilstar connects, and retries until 42 is there, or listens where 42 is the client.
 """
 
-import contextlib
 import re
-import select
-import socket
 from collections.abc import Sequence
 from datetime import date
 
 import numpy as np
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, check_use, parse_endpoint
-from hilstar.attitude.wire.links import Arrival, Link, LockstepLink, RawMessage, StreamLink
+from hilstar.attitude.wire.links import (
+    Arrival,
+    Decoder,
+    LockstepLink,
+    MessageLink,
+    StreamLink,
+    pieces,
+)
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, checked_sample
+from hilstar.attitude.wire.roads import RawMessage, RoadUse
 from hilstar.attitude.wire.source import Conventions, Mounting, components
-from hilstar.attitude.wire.udp import ANCILLARY_BYTES, KernelStamps
+from hilstar.attitude.wire.tcp import TcpRoad
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.notices import Notices
@@ -45,11 +50,6 @@ EPOCH_DAY = date(1970, 1, 1).toordinal()
 SECONDS_PER_DAY = 86_400
 SHOWN_CHARACTERS = 60
 ACK = b"Ack\n"
-CONNECT_S = 0.3
-RETRY_S = 0.25
-MAX_READ_BYTES = 65_536
-# A peer whose cable was pulled says nothing: the kernel asks.
-KEEPALIVE = {socket.TCP_KEEPIDLE: 3, socket.TCP_KEEPINTVL: 1, socket.TCP_KEEPCNT: 3}
 
 
 def written(q_icrs_to_body: FloatArray) -> str:
@@ -173,13 +173,68 @@ def _time_ns(text: str) -> int | None:
     return seconds * NS_PER_S + int((match[6] or "").ljust(9, "0"))
 
 
-class _Connection(Link):
-    """One connection at a time; a second one is closed at once. Raises InputError where it
-    cannot be bound.
-    """
+THIS_MACHINE = AllowedSenders()
+USE = RoadUse(
+    table="[attitude]",
+    where="",
+    lost="lost",
+    lost_line="{endpoint}: 42 closed the connection; waiting for it to come back",
+    back="back",
+    back_line="42 is connected again",
+    second_line="a second connection, from {host}, is closed; 42 has one already",
+)
 
-    stamped = True
+
+def tcp_road(
+    endpoint: str,
+    *,
+    bind: bool = False,
+    allowed: AllowedSenders = THIS_MACHINE,
+    notices: Notices | None = None,
+    clock: HostClock = HOST_CLOCK,
+) -> TcpRoad:
+    """The TCP connection to 42 of an endpoint. Raises InputError where it is none, or cannot be
+    bound.
+    """
+    place = parse_endpoint(endpoint)
+    check_use(place, endpoint, bind=bind)
+    if place.path is not None:
+        raise InputError(
+            f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001"
+        )
+    host, _, port = place.address.removeprefix("tcp://").rpartition(":")
+    host = "0.0.0.0" if host == "*" else host.strip("[]")
+    number = 0 if port == "*" else int(port)
+    road = TcpRoad((host, number), allowed, USE, notices, clock, listening=bind)
+    if not bind:
+        road.endpoint = endpoint  # as it was written
+    return road
+
+
+class MessageDecoder(Decoder):
+    """42's messages, cut anywhere as they come, for one spacecraft."""
+
     conventions = CONVENTIONS
+
+    def __init__(self, reader: MessageReader) -> None:
+        self._reader = reader
+        self.begin()
+
+    def begin(self) -> None:
+        """See `Decoder.begin`."""
+        self._splitter = MessageSplitter()
+
+    def whole(self, chunk: RawMessage) -> list[RawMessage]:
+        """See `Decoder.whole`."""
+        return pieces(chunk, self._splitter.feed(chunk.parts[0]))
+
+    def event(self, message: bytes) -> Event:
+        """See `Decoder.event`."""
+        return self._reader.decode(message)
+
+
+class _Nasa42(MessageLink):
+    """42 waits for an acknowledgement of each message."""
 
     def __init__(
         self,
@@ -187,171 +242,30 @@ class _Connection(Link):
         reader: MessageReader,
         *,
         bind: bool = False,
-        allowed: AllowedSenders | None = None,
+        allowed: AllowedSenders = THIS_MACHINE,
         notices: Notices | None = None,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
-        super().__init__(notices, clock)
-        place = parse_endpoint(endpoint)
-        check_use(place, endpoint, bind=bind)
-        if place.path is not None:
-            raise InputError(
-                f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001"
-            )
-        self.endpoint = endpoint
-        self.verb = "bound to" if bind else "connecting to"
-        host, _, port = place.address.removeprefix("tcp://").rpartition(":")
-        self._place = (
-            "0.0.0.0" if host == "*" else host.strip("[]"),
-            0 if port == "*" else int(port),
-        )
-        self._reader = reader
-        self._splitter = MessageSplitter()
-        self._allowed = AllowedSenders() if allowed is None else allowed
-        self._connection: socket.socket | None = None
-        self._retry = clock.within(0.0)
-        self._listener: socket.socket | None = None
-        if bind:
-            six = ":" in self._place[0]
-            try:
-                self._listener = socket.create_server(
-                    self._place, family=socket.AF_INET6 if six else socket.AF_INET
-                )
-            except OSError as error:
-                raise InputError(
-                    f"{endpoint}: cannot bind ({error.strerror}); write another address or port"
-                ) from error
-            self._listener.setblocking(False)
-            bound = f"[{self._place[0]}]" if six else self._place[0]
-            self.endpoint = f"tcp://{bound}:{self._listener.getsockname()[1]}"
+        road = tcp_road(endpoint, bind=bind, allowed=allowed, notices=notices, clock=clock)
+        super().__init__(road, MessageDecoder(reader))
 
-    def messages(self, timeout_ms: int) -> list[RawMessage]:
-        if self._connection is None and self._listener is None:
-            self._connect(timeout_ms)
-        if not self.wait_for_message(timeout_ms):
-            return []
-        if self._connection is not None:
-            try:
-                chunk, ancillary, _, _ = self._connection.recvmsg(MAX_READ_BYTES, ANCILLARY_BYTES)
-                host_ns = self._stamps.arrived_ns(ancillary, self._clock.now_ns())
-            except BlockingIOError:
-                self._accept()
-                return []
-            except OSError:
-                chunk = b""
-            if chunk:
-                whole = self._splitter.feed(chunk)
-                # The kernel's stamp is that of the last.
-                return [
-                    RawMessage(host_ns, [m], self._stamps.empty_ns, k == len(whole))
-                    for k, m in enumerate(whole, 1)
-                ]
-            self.link_counts.lost += 1
-            self._notices.tell(
-                "lost", f"{self.endpoint}: 42 closed the connection; waiting for it to come back"
-            )
-            self._shut()
-        self._accept()
-        return []
-
-    def arrival(self, message: RawMessage) -> Arrival[Event]:
-        return Arrival(
-            message.host_ns,
-            self._reader.decode(message.parts[0]),
-            message.parts[0],
-            message.waited_ns,
-        )
-
-    def acknowledge(self, count: int = 1) -> None:
-        """Let 42 compute on: it waits after each message."""
-        if self._connection is not None and count:
-            with contextlib.suppress(OSError):  # one that is gone is noticed by the next read
-                self._connection.send(ACK * count)
-
-    def _connect(self, timeout_ms: int) -> None:
-        if not self._retry.over:
-            self._clock.sleep(min(self._retry.left_s, timeout_ms / 1000))
-            return
-        self._retry = self._clock.within(RETRY_S)
-        with contextlib.suppress(OSError):
-            self._take(socket.create_connection(self._place, timeout=CONNECT_S))
-
-    def _accept(self) -> None:
-        while self._listener is not None:
-            try:
-                made, peer = self._listener.accept()
-            except OSError:
-                return
-            if not self._allowed.admits(peer[0]):
-                self.link_counts.rejected += 1
-                self._notices.begin(
-                    "sender-not-allowed",
-                    f"a connection from {peer[0]} is closed: it is not in [attitude] allow",
-                )
-            elif self._connection is not None:
-                self.link_counts.refused += 1
-                self._notices.tell(
-                    "connections-refused",
-                    f"a second connection, from {peer[0]}, is closed; 42 has one already",
-                )
-            else:
-                self._take(made)
-                continue
-            made.close()
-
-    def _take(self, made: socket.socket) -> None:
-        self.link_counts.connections += 1
-        made.setblocking(False)
-        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in KEEPALIVE.items():
-            made.setsockopt(socket.IPPROTO_TCP, option, value)
-        self._splitter = MessageSplitter()
-        self._connection, self._stamps = made, KernelStamps(made, self._clock)
-        if self.link_counts.connections > 1:
-            self._notices.tell("back", "42 is connected again")
-
-    def wait_for_message(self, timeout_ms: int) -> bool:
-        waited = [
-            waiting_socket
-            for waiting_socket in (self._listener, self._connection)
-            if waiting_socket is not None
-        ]
-        if not waited:
-            return False
-        poll = select.poll()
-        for waiting_socket in waited:
-            poll.register(waiting_socket, select.POLLIN)
-        asked_ns = self._clock.now_ns()
-        waits = bool(poll.poll(timeout_ms))
-        if not waits and self._connection is not None:
-            self._stamps.empty_ns = asked_ns
-        return waits
-
-    def _shut(self) -> None:
-        connection = self._connection
-        self._connection = None
-        if connection is not None:
-            connection.close()
-
-    def close(self) -> None:
-        self._shut()
-        if self._listener is not None:
-            self._listener.close()
+    def _acknowledge(self, count: int = 1) -> None:
+        """Let 42 compute on."""
+        if count:
+            self._road.put(ACK * count)
 
 
-class Nasa42Link(_Connection, StreamLink):
+class Nasa42Link(_Nasa42, StreamLink):
     """42 runs freely: each message is acknowledged as it is read."""
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The messages that have arrived, and only the newest of a flood; each is acknowledged."""
-        messages = self.messages(timeout_ms)
-        self.acknowledge(len(messages))
-        # 42 declares none
-        return [self.arrival(message) for message in self._gate.newest(messages, lambda _: False)]
+    def messages(self, timeout_ms: int) -> list[RawMessage]:
+        """See `MessageLink.messages`; each is acknowledged."""
+        messages = super().messages(timeout_ms)
+        self._acknowledge(len(messages))
+        return messages
 
 
-class Nasa42Lockstep(_Connection, LockstepLink):
+class Nasa42Lockstep(_Nasa42, LockstepLink):
     """42 waits for each frame: its message is acknowledged once the frame is shown."""
 
     _waiting: Sequence[RawMessage] = ()
@@ -362,8 +276,8 @@ class Nasa42Lockstep(_Connection, LockstepLink):
         if not self._waiting:
             return None
         first, *self._waiting = self._waiting
-        return self.arrival(first)
+        return self._decoder.arrivals([first])[0]
 
     def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
         """Let 42 compute on."""
-        self.acknowledge()
+        self._acknowledge()

@@ -1,5 +1,5 @@
-"""Serial ports: the link of COBS frames on a device that may be unplugged and come back, lines
-of text, and the RTS output.
+"""Serial ports: the road of a device that may be unplugged and come back, the link of COBS frames
+on it, lines of text, and the RTS output.
 """
 
 import contextlib
@@ -12,6 +12,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import serial
 from serial.tools import list_ports
@@ -19,17 +20,22 @@ from serial.tools import list_ports
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, unframed_packet
-from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
+from hilstar.attitude.wire.links import Decoder, StreamLink, pieces
+from hilstar.attitude.wire.roads import (
+    ATTITUDES,
+    ByteRoad,
+    RawMessage,
+    RoadUse,
+    is_readable,
+    read_device,
+)
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.basics.errors import HilstarError, InputError, NotThereError, one_line
 from hilstar.basics.notices import Notices
-from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, HostClock
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.basics.units import NS_PER_S
 
 DEFAULT_BAUD = 115_200
-MIN_BACK_OFF_S = 0.05
-MAX_BACK_OFF_S = 0.4  # a device that comes back is opened within a second
-MAX_READ_BYTES = 65_536  # in one go
 MAX_DRAIN_S, DRAIN_LOOK_S = 0.5, 0.005
 BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # the COBS byte and the 0x00
@@ -83,126 +89,59 @@ def open_port(port: str, baud: int) -> serial.Serial:
     return device
 
 
-class SerialLink(StreamLink):
+class SerialRoad(ByteRoad):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
     Raises InputError where the port cannot be opened at the start, MachineError where it is not
     there.
     """
 
-    two_way = True
-    verb = "reading"
-
     def __init__(
         self,
         port: str,
         baud: int,
+        use: RoadUse = ATTITUDES,
         notices: Notices | None = None,
         clock: HostClock = HOST_CLOCK,
-        *,
-        sent: SentAttitudes = AS_SENT,
     ) -> None:
-        super().__init__(notices, clock)
-        self.conventions = sent.conventions
-        self._decode = sent.decoder(wire.decode_frame)
-        self.endpoint = f"serial:{port}@{baud}"
+        super().__init__(f"serial:{port}@{baud}", use, notices, clock)
         self._port = port
         self._baud = baud
-        self._reopened = 0
-        self._decoder = wire.StreamDecoder()
-        self._recent = b""
-        self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
+        self._device: serial.Serial | None = None
         try:
-            self._device: serial.Serial | None = self._open()
+            self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
-            raise opening_refusal(self.endpoint, error, port) from error
+            raise opening_refusal(f"{use.where}{self.endpoint}", error, port) from error
 
-    @property
-    def reconnects(self) -> int:
-        """How often the device came back."""
-        return self._reopened
+    def _open(self) -> None:
+        self._device = open_port(self._port, self._baud)
+        self._opened()
 
-    @property
-    def trouble(self) -> str:
-        """See `Link.trouble`: the bytes that came, and are no frame."""
-        unended = self._decoder.unended
-        if unended:
-            return f"{self.endpoint}: {wire.unended_line(unended)}"
-        return ""
-
-    def _open(self) -> serial.Serial:
-        self._decoder = wire.StreamDecoder()
-        return open_port(self._port, self._baud)
-
-    def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
-        """The frames that have arrived, and only the newest of a flood; waits at most
-        `timeout_ms` for the first byte.
-        """
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `ByteRoad.taken`."""
         device = self._device
         if device is None:
-            self._reopen(timeout_ms)
+            self._try_again(self._open, LOST, timeout_ms)
             return []
         try:
-            chunks = self._read(device, timeout_ms)
-        except (OSError, TypeError) as error:
-            # pyserial raises TypeError for a port closed meanwhile
-            self._lose(str(error))
+            return self._read(device, timeout_ms)
+        except LOST as error:
+            self._lose(_reason(error))
             return []
-        waiting: list[RawMessage] = []
-        for chunk in chunks:
-            self._recent = (self._recent + chunk.parts[0])[-MAX_LOOKED_AT:]
-            bodies = self._decoder.frames(chunk.parts[0])
-            # frames before the chunk's last were there earlier, and waited for it
-            for k, body in enumerate(bodies, 1):
-                waiting.append(
-                    chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies))
-                )
-        arrivals: list[Arrival[wire.Event]] = []
-        for frame in self._gate.newest(waiting, wire.frame_declares_discontinuity):
-            body = frame.parts[0]
-            arrivals.append(Arrival(frame.host_ns, self._event(body), body, frame.waited_ns))
-        return arrivals
-
-    def _event(self, body: bytes) -> wire.Event:
-        """What a frame says. One that says nothing may be a piece of a packet that was not
-        framed, cut at its zeros.
-        """
-        event = self._decode(body)
-        if not isinstance(event, wire.Refusal) or event.reason != "format":
-            return event
-        unframed = unframed_packet(self._recent)
-        if unframed is None:
-            return event
-        return wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
-        if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
-            device.timeout = timeout_ms / 1000
-        data = device.read(1)
-        data += device.read(min(device.in_waiting, MAX_READ_BYTES)) if data else b""
-        now_ns = self._clock.now_ns()
-        if data:
-            return [RawMessage(now_ns, [data], now_ns)]
-        return []
+        return read_device(device.fileno(), timeout_ms, self._clock)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once unread bytes wait."""
         device = self._device
         try:
-            return device is not None and bool(
-                select.select([device.fileno()], [], [], timeout_ms / 1000)[0]
-            )
-        except (OSError, ValueError, TypeError):  # gone: `receive` notices, and reports it
+            return device is not None and is_readable(device.fileno(), timeout_ms)
+        except LOST:  # gone: `taken` notices, and reports it
             return False
 
-    def send(self, packet: wire.Packet) -> None:
-        """Send to the other side without waiting: what the line does not take at once is lost."""
-        self.send_bytes(wire.frame(packet))
-
-    def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """Send bytes as they are, waiting at most `patience_s` while the line is full; False
-        where some were lost.
-        """
+    def put(self, data: bytes, patience_s: float = 0.0) -> bool:
+        """See `ByteRoad.put`: what a full line does not take within `patience_s` is lost."""
         device = self._device
         if device is None:
             return False
@@ -215,8 +154,8 @@ class SerialLink(StreamLink):
                 if not data or deadline.over:
                     break
                 select.select([], [device.fileno()], [], deadline.left_s)
-        except (OSError, ValueError, TypeError) as error:
-            self._lose(str(error))
+        except LOST as error:
+            self._lose(_reason(error))
             return False
         return not data
 
@@ -232,36 +171,15 @@ class SerialLink(StreamLink):
                     return
                 self._clock.sleep(DRAIN_LOOK_S)
 
-    def wire_ns(self, packet: wire.Packet) -> int:
-        """How long a packet's frame takes at this baud rate."""
-        return (len(wire.encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * NS_PER_S // self._baud
-
     def _lose(self, why: str) -> None:
-        self.link_counts.lost += 1
-        self._notices.tell(
-            "lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back"
-        )
+        super()._lose(why)
         self._shut()
-        self._retry.put_off(anew=True)
-
-    def _reopen(self, timeout_ms: int) -> None:
-        if not self._retry.over:
-            self._clock.sleep(min(self._retry.left_s, timeout_ms / 1000))
-            return
-        try:
-            self._device = self._open()
-        except (OSError, ValueError):
-            self._retry.put_off()
-            return
-        self._reopened += 1
-        self._notices.tell("back", f"{self.endpoint} is back")
-        self.send_bytes(wire.DELIMITER)
 
     def _shut(self) -> None:
         device = self._device
         self._device = None
         if device is not None:
-            with contextlib.suppress(OSError, TypeError):
+            with contextlib.suppress(*LOST):
                 device.close()
 
     def close(self) -> None:
@@ -269,9 +187,9 @@ class SerialLink(StreamLink):
         self._shut()
 
 
-class SerialApart(SerialLink):
-    """A SerialLink whose bytes a process of its own reads and stamps; it is opened, written to and
-    decoded here.
+class SerialRoadApart(SerialRoad):
+    """A SerialRoad whose bytes a process of its own reads and stamps; it is opened and written to
+    here.
 
     Raises InputError where the port cannot be opened at the start, MachineError where it is not
     there.
@@ -284,12 +202,11 @@ class SerialApart(SerialLink):
         self,
         port: str,
         baud: int,
+        use: RoadUse = ATTITUDES,
         notices: Notices | None = None,
         clock: HostClock = HOST_CLOCK,
-        *,
-        sent: SentAttitudes = AS_SENT,
     ) -> None:
-        super().__init__(port, baud, notices, clock, sent=sent)
+        super().__init__(port, baud, use, notices, clock)
         self._reader = ReaderProcess(self._notices, clock=clock)
 
     def await_ready(self) -> None:
@@ -323,6 +240,122 @@ class SerialApart(SerialLink):
         """Close the port, and end the process."""
         super().close()
         self._reader.close()
+
+
+class FrameSplitter(wire.StreamDecoder):
+    """A StreamDecoder that keeps the newest bytes as they came."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.recent = b""
+
+    def frames(self, chunk: bytes) -> list[bytes]:
+        """See `StreamDecoder.frames`."""
+        self.recent = (self.recent + chunk)[-MAX_LOOKED_AT:]
+        return super().frames(chunk)
+
+
+class SerialDecoder(Decoder):
+    """COBS frames, each ended by 0x00, and the packets in them."""
+
+    def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
+        self.conventions = sent.conventions
+        self._decode = sent.decoder(wire.decode_frame)
+        self.begin()
+
+    def begin(self) -> None:
+        """See `Decoder.begin`."""
+        self._splitter = FrameSplitter()
+
+    def whole(self, chunk: RawMessage) -> list[RawMessage]:
+        """See `Decoder.whole`."""
+        return pieces(chunk, self._splitter.frames(chunk.parts[0]))
+
+    def declares_discontinuity(self, message: bytes) -> bool:
+        """See `Decoder.declares_discontinuity`."""
+        return wire.frame_declares_discontinuity(message)
+
+    @property
+    def unended(self) -> bytes:
+        """See `StreamDecoder.unended`."""
+        return self._splitter.unended
+
+    def event(self, message: bytes) -> wire.Event:
+        """What a frame says. One that says nothing may be a piece of a packet that was not
+        framed, cut at its zeros.
+        """
+        event = self._decode(message)
+        if not isinstance(event, wire.Refusal) or event.reason != "format":
+            return event
+        unframed = unframed_packet(self._splitter.recent)
+        if unframed is None:
+            return event
+        return wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
+
+
+class SerialLink(StreamLink):
+    """COBS frames on a serial port, both ways.
+
+    Raises InputError where the port cannot be opened at the start, MachineError where it is not
+    there.
+    """
+
+    two_way = True
+    road_kind: ClassVar[type[SerialRoad]] = SerialRoad
+    _road: SerialRoad
+    _decoder: SerialDecoder
+
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+        *,
+        sent: SentAttitudes = AS_SENT,
+    ) -> None:
+        road = self.road_kind(port, baud, ATTITUDES, notices, clock)
+        super().__init__(road, SerialDecoder(sent))
+        self._baud = baud
+
+    @property
+    def trouble(self) -> str:
+        """See `Link.trouble`: the bytes that came, and are no frame."""
+        unended = self._decoder.unended
+        if unended:
+            return f"{self.endpoint}: {wire.unended_line(unended)}"
+        return ""
+
+    def _begin(self) -> None:
+        """The other side's first frame after a gap begins anew, too."""
+        super()._begin()
+        self.send_bytes(wire.DELIMITER)
+
+    def send(self, packet: wire.Packet) -> None:
+        """Send to the other side without waiting: what the line does not take at once is lost."""
+        self.send_bytes(wire.frame(packet))
+
+    def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
+        """Send bytes as they are: see `ByteRoad.put`."""
+        return self._road.put(data, patience_s)
+
+    def drain(self) -> None:
+        """See `SerialRoad.drain`."""
+        self._road.drain()
+
+    def wire_ns(self, packet: wire.Packet) -> int:
+        """How long a packet's frame takes at this baud rate."""
+        return (len(wire.encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * NS_PER_S // self._baud
+
+
+class SerialApart(SerialLink):
+    """A SerialLink whose bytes a process of its own reads and stamps; they are decoded here."""
+
+    road_kind = SerialRoadApart
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
 
 
 def opening_refusal(where: str, error: BaseException, port: str) -> HilstarError:

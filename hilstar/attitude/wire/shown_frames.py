@@ -27,7 +27,7 @@ import zmq
 
 from hilstar.attitude.wire.keys import NO_KEYS
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
+from hilstar.attitude.wire.zmq_links import ZmqRoad, ZmqSender
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import one_line
 
@@ -171,7 +171,7 @@ class FrameSender(ZmqSender):
             self._ready().send_multipart(frame_parts(frame), zmq.NOBLOCK, copy=False)
 
 
-class FrameWatch(ZmqReceiver):
+class FrameWatch(ZmqRoad):
     """The watcher's end: connects to where the frames are sent from. `refused` counts messages
     that are no frames.
     """
@@ -179,20 +179,21 @@ class FrameWatch(ZmqReceiver):
     def __init__(self, endpoint: str) -> None:
         self.refused = 0
         self.why_refused = ""
-        super().__init__(endpoint, keys=NO_KEYS, max_part_bytes=MAX_FRAME_BYTES)
-
-    def _configure(self, made: zmq.Socket[bytes]) -> None:
-        super()._configure(made)
-        made.setsockopt(zmq.RCVHWM, WAITING_FRAMES)
+        super().__init__(
+            endpoint,
+            queue_messages=WAITING_FRAMES,
+            keys=NO_KEYS,
+            max_part_bytes=MAX_FRAME_BYTES,
+        )
 
     def frames(self, timeout_ms: int) -> list[ShownFrame]:
         """The frames that came, oldest first; waits at most `timeout_ms` for the first."""
-        found = []
+        frames_shown = []
         for message in self.taken(timeout_ms):
             frame = read_frame(list(message.parts))
             if isinstance(frame, ShownFrame):
-                found.append(frame)
+                frames_shown.append(frame)
             else:
                 self.refused = self.refused + 1
                 self.why_refused = frame
-        return found
+        return frames_shown

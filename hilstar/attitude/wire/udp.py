@@ -27,16 +27,10 @@ from functools import partial
 from typing import Any
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
-from hilstar.attitude.wire.links import PAUSE_S, Arrival, RawMessage, StreamLink
-from hilstar.attitude.wire.packet import (
-    MAX_JSON_BYTES,
-    Event,
-    Packet,
-    Status,
-    declares_discontinuity,
-    decode,
-    encode,
-)
+from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
+from hilstar.attitude.wire.links import Arrival, PacketDecoder, StreamLink
+from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, encode
+from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, RawMessage, RoadUse
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -51,10 +45,6 @@ LOAD_WORD, AND, JUMP_IF_EQUAL, RETURN = 0x20, 0x54, 0x15, 0x06
 WHOLE, NOTHING = 0xFFFF, 0
 INSTRUCTION = struct.Struct("=HBBI")
 MAX_INSTRUCTIONS = 4096
-# Linux's number (asm-generic/socket.h); the stamp is a timespec of CLOCK_REALTIME
-SO_TIMESTAMPNS = 35
-TIMESPEC = struct.Struct("@ll")
-ANCILLARY_BYTES = socket.CMSG_SPACE(TIMESPEC.size)
 # the rest of a longer one is cut off, and `packet.decode` refuses what is left
 MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1
 # the kernel gives what it allows; a small datagram takes some 800 bytes of it
@@ -87,12 +77,12 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
         if network.version != version:
             continue
         address, mask = network.network_address.packed, network.netmask.packed
-        words = range(0, len(address), WORD_BYTES)
+        word_places = range(0, len(address), WORD_BYTES)
         # each word of the source address must be the network's, else go on after this network
-        for k, at in enumerate(words):
+        for k, at in enumerate(word_places):
             address_word = int.from_bytes(address[at : at + WORD_BYTES], "big")
             mask_word = int.from_bytes(mask[at : at + WORD_BYTES], "big")
-            to_next_network = 3 * (len(words) - k - 1) + 1
+            to_next_network = 3 * (len(word_places) - k - 1) + 1
             code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + SOURCE_AT[version] + at))
             code.append(INSTRUCTION.pack(AND, 0, 0, mask_word))
             code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, to_next_network, address_word))
@@ -114,37 +104,6 @@ def keep_only_networks(receiving: socket.socket, networks: Sequence[Network]) ->
         receiving.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, pointer)
         return True
     return False
-
-
-class KernelStamps:
-    """Has the kernel stamp arrivals at `receiving`; where it cannot, the time of reading counts.
-
-    `empty_ns` is when nothing waited last, host time: what is read arrived later than that. Of a
-    TCP stream the stamp is that of the last byte read.
-    """
-
-    def __init__(self, receiving: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
-        self._clock = clock
-        self.empty_ns = clock.now_ns()
-        with contextlib.suppress(OSError):
-            receiving.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-
-    def arrived_ns(
-        self, ancillary: list[tuple[int, int, bytes]], now_ns: int, offset_ns: int | None = None
-    ) -> int:
-        """When something came, from what `recvmsg` told at `now_ns`.
-
-        A realtime clock that was set meanwhile moves it by no more than it waited.
-        `offset_ns` is the clock's `monotonic_minus_realtime_ns()`, where it was asked for already.
-        """
-        for _, kind, stamp in ancillary:
-            if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
-                seconds, ns = TIMESPEC.unpack(stamp)
-                if offset_ns is None:
-                    offset_ns = self._clock.monotonic_minus_realtime_ns()
-                stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
-                return min(max(stamped_ns, self.empty_ns), now_ns)
-        return now_ns
 
 
 class Datagrams:
@@ -184,7 +143,7 @@ class Datagrams:
         return cls(made, clock)
 
     @classmethod
-    def connected(cls, host: str, port: int) -> "Datagrams":
+    def connected(cls, host: str, port: int, clock: HostClock = HOST_CLOCK) -> "Datagrams":
         """Connected to a peer: only its datagrams arrive. Raises OSError where the host is
         unknown.
         """
@@ -195,7 +154,7 @@ class Datagrams:
         except OSError:
             made.close()
             raise
-        return cls(made)
+        return cls(made, clock)
 
     @property
     def port(self) -> int:
@@ -284,73 +243,75 @@ class Credit:
         return True
 
 
-class UdpLink(StreamLink):
-    """A bound socket. Raises InputError where it cannot be bound.
+class UdpRoad(ByteRoad):
+    """Datagrams: bound to a place, with the senders that are allowed, or connected to a peer.
 
-    Each arrival says how to answer its sender (`Arrival.back`); the link itself knows no sender to
-    send to.
+    Raises InputError where that cannot be.
     """
 
-    two_way = stamped = True
+    messages = stamped = True
     verb = "bound to"
 
     def __init__(
         self,
-        place: UdpPlace,
+        place: UdpPlace | tuple[str, int],
         allowed: AllowedSenders,
+        use: RoadUse = ATTITUDES,
         notices: Notices | None = None,
         clock: HostClock = HOST_CLOCK,
-        *,
-        sent: SentAttitudes = AS_SENT,
     ) -> None:
-        super().__init__(notices, clock)
-        self.conventions = sent.conventions
-        self._decode = sent.decoder(decode)
-        self._allowed = allowed
-        self._credit = Credit()
+        self._allowed: AllowedSenders | None = None
         self._strangers = self._dropped = self._looked_ns = 0
         self._filtered = False
-        self._datagrams = Datagrams.bound(place, clock)
-        self.endpoint = str(UdpPlace(place.host, self._datagrams.port))
+        if isinstance(place, UdpPlace):
+            self._allowed = allowed
+            try:
+                self._datagrams = Datagrams.bound(place, clock)
+            except InputError as error:
+                raise InputError(f"{use.where}{error}") from error
+            endpoint = str(UdpPlace(place.host, self._datagrams.port))
+        else:
+            endpoint = f"udp://{place[0]}:{place[1]}"
+            try:
+                self._datagrams = Datagrams.connected(*place, clock)
+            except OSError as error:
+                raise InputError(
+                    f"{use.where}{endpoint}: {error.strerror}; write the tracker's address"
+                ) from error
+        super().__init__(endpoint, use, notices, clock)
+        self._opened()
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The waiting datagrams of allowed senders, oldest first, and only the newest of a
-        flood.
-        """
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The waiting datagrams of allowed senders, oldest first; see `ByteRoad.taken`."""
         if not self._datagrams.wait(timeout_ms):
             return []
-        taken = self._datagrams.take(MAX_TAKEN)
-        waiting: list[RawMessage] = []
-        for datagram in taken:
+        datagrams = self._datagrams.take(MAX_TAKEN)
+        if self._allowed is None:
+            return datagrams
+        admitted: list[RawMessage] = []
+        for datagram in datagrams:
             host = (datagram.sender or ("",))[0]
             if self._allowed.admits(host):
-                waiting.append(datagram)
+                admitted.append(datagram)
                 continue
             self.link_counts.rejected += 1
             notice = (
-                f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones"
-                " are only counted"
+                f"datagrams from {host} are dropped: it is not in {self._use.table} allow; further"
+                " ones are only counted"
             )
             self._notices.begin("sender-not-allowed", notice)
-        self._look(len(taken) - len(waiting))
-        admitted = self._gate.newest(waiting, declares_discontinuity)
-        if len(taken) == MAX_TAKEN:
+        self._look(self._allowed, len(datagrams) - len(admitted))
+        if len(datagrams) == MAX_TAKEN:
             self._clock.sleep(PAUSE_S)
-        arrivals: list[Arrival[Event]] = []
-        for host_ns, (data,), _, _, sender in admitted:
-            peer = sender or ()
-            self._credit.earn(peer, len(data))
-            back = partial(self._answer, peer)
-            arrivals.append(Arrival(host_ns, self._decode(data), data, back=back, address=sender))
-        return arrivals
+        return admitted
 
-    def _look(self, strangers: int) -> None:
+    def _look(self, allowed: AllowedSenders, strangers: int) -> None:
         """Count what the kernel dropped, and have it drop the strangers where they are many."""
         self._strangers += strangers
         now_ns = self._clock.now_ns()
         if self._strangers > MAX_STRANGERS and not self._filtered:
             self._filtered = True
-            if self._datagrams.keep_only(self._allowed.networks):
+            if self._datagrams.keep_only(allowed.networks):
                 notice = (
                     f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed:"
                     " the kernel drops them now"
@@ -363,15 +324,63 @@ class UdpLink(StreamLink):
             self.link_counts.flooded += dropped - self._dropped
             self._dropped = dropped
 
-    def _answer(self, peer: SocketAddress, packet: Packet) -> None:
-        data = encode(packet)
-        if isinstance(packet, Status) or self._credit.spend(peer, len(data)):
-            self._datagrams.put(data, peer)
-
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a datagram waits."""
         return self._datagrams.wait(timeout_ms)
 
+    def put(self, data: bytes, patience_s: float = 0.0) -> bool:
+        """See `ByteRoad.put`; nothing is waited for, and a bound road knows nobody to send to."""
+        return self._allowed is None and self._datagrams.put(data)
+
+    def put_to(self, peer: SocketAddress, data: bytes) -> bool:
+        """Send to one of several senders, never waiting; False where it did not leave."""
+        return self._datagrams.put(data, peer)
+
     def close(self) -> None:
         """Close the socket."""
         self._datagrams.close()
+
+
+class DatagramDecoder(PacketDecoder):
+    """Packets of several senders, each of which is answered for itself, and never by more bytes
+    than came from it; statuses besides.
+    """
+
+    def __init__(self, road: UdpRoad, sent: SentAttitudes = AS_SENT) -> None:
+        super().__init__(sent)
+        self._road = road
+        self._credit = Credit()
+
+    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+        host_ns, (data,), _, _, sender = message
+        peer = sender or ()
+        self._credit.earn(peer, len(data))
+        back = partial(self._answer, peer)
+        return Arrival(host_ns, self.event(data), data, back=back, address=sender)
+
+    def _answer(self, peer: SocketAddress, packet: Packet) -> None:
+        data = encode(packet)
+        if isinstance(packet, Status) or self._credit.spend(peer, len(data)):
+            self._road.put_to(peer, data)
+
+
+class UdpLink(StreamLink):
+    """A bound socket. Raises InputError where it cannot be bound.
+
+    Each arrival says how to answer its sender (`Arrival.back`); the link itself knows no sender to
+    send to.
+    """
+
+    two_way = True
+
+    def __init__(
+        self,
+        place: UdpPlace,
+        allowed: AllowedSenders,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+        *,
+        sent: SentAttitudes = AS_SENT,
+    ) -> None:
+        road = UdpRoad(place, allowed, ATTITUDES, notices, clock)
+        super().__init__(road, DatagramDecoder(road, sent))

@@ -14,18 +14,17 @@ SIM_UPDATE is not answered with OK.
 Broadcast: Basilisk's PUB socket binds, and hilstar's SUB socket connects.
 """
 
-import contextlib
 import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal, Unpack
 
 import numpy as np
-import zmq
 
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.endpoint import parse_endpoint
-from hilstar.attitude.wire.links import Arrival, LockstepLink, Pictures, RawMessage, TrackerCamera
+from hilstar.attitude.wire.links import Arrival, Decoder, LockstepLink, Pictures, TrackerCamera
+from hilstar.attitude.wire.roads import RawMessage
 from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard_message import (
     Components,
@@ -35,8 +34,8 @@ from hilstar.attitude.wire.vizard_message import (
     WireFormatError,
     decode_update,
 )
-from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
-from hilstar.attitude.wire.zmq_socket import SocketOptions, ZmqSocket
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.attitude.wire.zmq_socket import SocketOptions, ZmqReply
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, printable, shortened
 from hilstar.basics.notices import Notices
@@ -351,20 +350,19 @@ def _against(own: Components, other: Components) -> Components:
     return own
 
 
-class VizardLive(ZmqSocket, LockstepLink):
+class VizardLive(LockstepLink):
     """A REP socket in Vizard's place; it binds, or connects with `bind=False`. Pictures of
     cameras are answered here.
     """
 
     asks_for_pictures = True
+    _road: ZmqReply
 
     def __init__(self, endpoint: str, follower: Follower, **options: Unpack[SocketOptions]) -> None:
         check_loopback(endpoint)
-        options.setdefault("bind", True)
         options["max_part_bytes"] = MAX_UPDATE_BYTES
-        super().__init__(zmq.REP, endpoint, **options)
+        super().__init__(ZmqReply(endpoint, **options), follower.conventions)
         self._follower = follower
-        self.conventions = follower.conventions
         self._tracker: TrackerCamera | None = None
         self._pictures: Pictures | None = None
         self._sample: wire.AttitudeSample | None = None  # at the last step
@@ -380,27 +378,24 @@ class VizardLive(ZmqSocket, LockstepLink):
 
     def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next step, or None; it must be answered before the next request can arrive."""
-        if self._waits(timeout_ms):
-            parts = self._take_parts()
-        else:
-            parts = None
-        if parts is None:
+        request = self._road.request(timeout_ms)
+        if request is None:
             return None
-        host_ns = self._clock.now_ns()
+        parts = list(request.parts)
         word = parts[0]
         if word == SIM_UPDATE:
-            return self._step(host_ns, parts)
+            return self._step(request.host_ns, parts)
         number = word.removeprefix(REQUEST_IMAGE)[:MAX_DIGITS]
         if word.startswith(REQUEST_IMAGE) and number.isdigit():
             image = self._picture(int(number))
             # the length goes ahead, big-endian; 0 where there is none
-            self._answer([len(image).to_bytes(4, "big"), image])
+            self._road.put_parts([len(image).to_bytes(4, "big"), image])
             return None
         if word not in PLAIN_ANSWERS:
             self._notices.tell(
                 "unknown-request", f"{shortened(repr(word[:40]))} is none of Basilisk's requests"
             )
-        self._answer(PLAIN_ANSWERS.get(word, [ERROR]))
+        self._road.put_parts(PLAIN_ANSWERS.get(word, [ERROR]))
         return None
 
     def _step(self, host_ns: int, parts: list[bytes]) -> Arrival[wire.Event]:
@@ -433,12 +428,7 @@ class VizardLive(ZmqSocket, LockstepLink):
 
     def answer(self, status: wire.Status, shown_ns: int, refusal: wire.Refusal | None) -> None:
         """Let the simulation go on; or, where its step was refused, end it."""
-        self._answer([OK if refusal is None else ERROR])
-
-    def _answer(self, parts: list[bytes]) -> None:
-        """A simulation that is gone, or does not read, gets no answer."""
-        with contextlib.suppress(zmq.Again):
-            self._ready().send_multipart(parts, zmq.NOBLOCK)
+        self._road.put_parts([OK if refusal is None else ERROR])
 
 
 class Opening:
@@ -476,11 +466,10 @@ class Opening:
         return released
 
 
-class BroadcastDecoder(PacketDecoder):
+class BroadcastDecoder(Decoder):
     """What SIM_UPDATE messages mean; the very first ones are held back for a moment."""
 
     def __init__(self, follower: Follower, clock: HostClock = HOST_CLOCK) -> None:
-        super().__init__()
         self._follower = follower
         self.conventions = follower.conventions
         self._clock = clock
@@ -499,7 +488,11 @@ class BroadcastDecoder(PacketDecoder):
                 f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage",
             )
             return Arrival(message.host_ns, refusal, parts[-1], message.waited_ns)
-        return Arrival(message.host_ns, self._follower.take(update)[0], update, message.waited_ns)
+        return Arrival(message.host_ns, self.event(update), update, message.waited_ns)
+
+    def event(self, message: bytes) -> wire.Event:
+        """See `Decoder.event`."""
+        return self._follower.take(message)[0]
 
 
 def vizard_broadcast(

@@ -5,7 +5,6 @@ one source to its heads.
 import contextlib
 import math
 import struct
-from collections.abc import Iterable
 from functools import partial
 from typing import Any, Unpack
 
@@ -15,15 +14,27 @@ import zmq
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
+from hilstar.attitude.wire.links import (
+    Arrival,
+    Decoder,
+    LockstepLink,
+    PacketDecoder,
+    StreamLink,
+)
+from hilstar.attitude.wire.roads import ATTITUDES, ByteRoad, LinkCounts, RawMessage
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
-from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, SocketOptions, ZmqSocket
+from hilstar.attitude.wire.zmq_socket import (
+    QUEUE_MESSAGES,
+    SocketOptions,
+    ZmqReply,
+    ZmqSocket,
+    trouble_of,
+)
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import caught
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 
-MAX_TAKEN_BYTES = 8_000_000  # in one go
 SEND_QUEUE_MESSAGES = 10_000
 MAX_SUBSCRIPTION_BYTES = 1024
 RECONNECT_S = 0.25
@@ -31,32 +42,12 @@ TEND_S = 0.05
 STAMP = struct.Struct("<q")  # host time of arrival, ns: one clock for all processes of a machine
 
 
-class PacketDecoder:
-    """Says what the messages of a free stream mean: packets or JSON, of which only the last part
-    counts.
-    """
-
-    stamped = False  # whether messages carry their own times of arrival
-
-    def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
-        self.conventions = sent.conventions
-        self.decode = sent.decoder(wire.decode)
-
-    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
-        """What messages say."""
-        return [self._arrival(message) for message in messages]
-
-    def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:
-        raw = message.parts[-1]
-        return Arrival(message.host_ns, self.decode(raw), raw, message.waited_ns)
-
-
 PACKET_DECODER = PacketDecoder()
 
 
-class ZmqReceiver(ZmqSocket, StreamLink):
+class ZmqRoad(ZmqSocket):
     """A SUB socket that takes every message that begins with `topic`; it connects, or binds with
-    `bind`.
+    `bind`. Of a full queue it keeps `queue_messages`, the oldest.
     """
 
     def __init__(
@@ -64,56 +55,30 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         endpoint: str,
         *,
         topic: bytes = b"",
-        decoder: PacketDecoder = PACKET_DECODER,
+        queue_messages: int = QUEUE_MESSAGES,
         **options: Unpack[SocketOptions],
     ) -> None:
-        self.topic = topic
-        self.decoder = decoder
-        self.bound = options.get("bind", False)
-        self.conventions = decoder.conventions
-        self.stamped = decoder.stamped
+        self._topic = topic
+        self._queue_messages = queue_messages
         super().__init__(zmq.SUB, endpoint, **options)
-        if not self.bound:  # a connecting socket hears nothing until a sender binds there
+        if not self._bind:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
         self._lost_until = self._clock.within(0.0)
 
     def opener(self) -> OpenStream:
-        """A function by which another process opens the same socket."""
+        """A function by which another process opens a link on the same socket."""
         more: dict[str, Any] = {
             "keys": self._keys,
-            "topic": self.topic,
+            "topic": self._topic,
             "max_part_bytes": self._max_part_bytes,
         }
         return partial(ZmqReceiver, self.endpoint, bind=self._bind, **more)
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
-        made.setsockopt(zmq.SUBSCRIBE, self.topic)
-
-    def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
-        """The waiting messages, oldest first, and only the newest of a flood; waits at most
-        `timeout_ms` for the first.
-        """
-        return self.decoder.arrivals(self.taken(timeout_ms))
-
-    def taken(self, timeout_ms: int) -> list[RawMessage]:
-        """The same, not decoded."""
-        if not self._waits(timeout_ms):
-            return []
-        waiting: list[RawMessage] = []
-        taken_bytes = 0
-        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES:
-            parts = self._take_parts()
-            if parts is None:
-                break
-            waiting.append(RawMessage(self._clock.now_ns(), parts))
-            taken_bytes += sum(map(len, parts))
-        return self._gate.newest(waiting, wire.declares_discontinuity)
-
-    def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once a message waits."""
-        return self._waits(timeout_ms)
+        made.setsockopt(zmq.RCVHWM, self._queue_messages)
+        made.setsockopt(zmq.SUBSCRIBE, self._topic)
 
     def _tend(self) -> None:
         """Connect anew where the peer is lost: libzmq does so, but not after a part over
@@ -130,43 +95,44 @@ class ZmqReceiver(ZmqSocket, StreamLink):
             self._socket.connect(self._address)
 
 
-class ZmqApart(StreamLink):
-    """A ZeroMQ stream whose socket is read by a separate process.
+class ZmqRoadApart(ByteRoad):
+    """The socket of a road, read by a separate process.
 
-    `link` was opened to see that it can be; it is closed here, and the other process opens the same
-    socket at the first read, so that no old messages collect in it.
+    The road was opened to see that it can be; it is closed here, and the other process opens the
+    same socket at the first read, so that no old messages collect in it. That process passes over
+    what is too much.
     """
 
-    stamped = True
+    messages = stamped = True
 
     def __init__(
-        self, link: ZmqReceiver, notices: Notices | None = None, clock: HostClock = HOST_CLOCK
+        self, road: ZmqRoad, notices: Notices | None = None, clock: HostClock = HOST_CLOCK
     ) -> None:
-        super().__init__(notices, clock)
-        link.close()
-        self.verb = link.verb
-        self.endpoint = link.endpoint
-        self.conventions = link.conventions
-        self.link_counts = link.link_counts
-        self._decoder = link.decoder
-        self.bound = link.bound
-        self._opener = link.opener()
+        super().__init__(road.endpoint, ATTITUDES, notices, clock)
+        road.close()
+        self.verb = road.verb
+        self.link_counts = road.link_counts
+        self._bound = road.bound
+        self._opener = road.opener()
         self._waiting: list[RawMessage] = []
         self._ordered = False
         self._reader = ReaderProcess(self._notices, clock=clock)
+
+    @property
+    def trouble(self) -> str:
+        """See `ZmqSocket.trouble`."""
+        return trouble_of(self.link_counts, self._notices)
 
     def await_ready(self) -> None:
         """Wait until the socket can be opened at once, or for a moment."""
         self._reader.await_ready()
 
-    def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
-        """The messages that came, oldest first, with their stamps; waits at most `timeout_ms`
-        for the first.
-        """
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The messages that came, oldest first, with their stamps; see `ByteRoad.taken`."""
         self.wait_for_message(timeout_ms)
         waiting = self._waiting
         self._waiting = []
-        return self._decoder.arrivals(waiting)
+        return waiting
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message has come."""
@@ -184,12 +150,51 @@ class ZmqApart(StreamLink):
                 if record.message is not None:
                     self._waiting.append(record.message)
                 if record.counts is not None:
-                    self.link_counts += record.counts
+                    self._count(record.counts)
         return bool(self._waiting)
+
+    def _count(self, grown: LinkCounts) -> None:
+        """Take what the other process has counted, and told, since it did so last."""
+        self.link_counts += grown
+        if not self._bound:
+            self.openings = self.link_counts.connections
 
     def close(self) -> None:
         """End the process, and with it the socket."""
         self._reader.close()
+
+
+class ZmqReceiver(StreamLink):
+    """What comes to a SUB socket; see `ZmqRoad`."""
+
+    _road: ZmqRoad
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        topic: bytes = b"",
+        decoder: Decoder = PACKET_DECODER,
+        **options: Unpack[SocketOptions],
+    ) -> None:
+        super().__init__(ZmqRoad(endpoint, topic=topic, **options), decoder)
+
+    def apart(self, notices: Notices | None, clock: HostClock) -> tuple[ZmqRoadApart, Decoder]:
+        """The same road, read by a separate process from now on, and the decoder."""
+        return ZmqRoadApart(self._road, notices, clock), self._decoder
+
+
+class ZmqApart(StreamLink):
+    """A ZmqReceiver whose socket is read by a separate process; see `ZmqRoadApart`."""
+
+    def __init__(
+        self, link: ZmqReceiver, notices: Notices | None = None, clock: HostClock = HOST_CLOCK
+    ) -> None:
+        super().__init__(*link.apart(notices, clock))
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `StreamLink.taken`: the other process has passed over what is too much."""
+        return self.messages(timeout_ms)
 
 
 class ZmqSender(ZmqSocket):
@@ -220,7 +225,7 @@ class ZmqSender(ZmqSocket):
         """True once there is a subscriber; messages sent before that are lost."""
         return self._waits(timeout_s * 1000) and self._take() is not None
 
-    def put(self, message: bytes) -> None:
+    def put(self, data: bytes, patience_s: float = 0.0) -> bool:
         """Send one message, never waiting."""
         if self._tended_until.over:
             self._tended_until = self._clock.within(TEND_S)
@@ -228,8 +233,7 @@ class ZmqSender(ZmqSocket):
             for _ in range(QUEUE_MESSAGES):  # libzmq keeps subscriptions until they are read
                 if self._take() is None:
                     break
-        with contextlib.suppress(zmq.Again):
-            self._ready().send(message, zmq.NOBLOCK)
+        return self._put([data])
 
     def close(self) -> None:
         """Close the socket; messages not sent within its linger time are lost."""
@@ -237,40 +241,35 @@ class ZmqSender(ZmqSocket):
         super().close()
 
 
-class ZmqLockstep(ZmqSocket, LockstepLink):
+class ZmqLockstep(LockstepLink):
     """A REP socket: one request is one attitude and gets one reply; it binds, or connects with
     `bind=False`.
     """
 
+    _road: ZmqReply
     _json = False  # whether the last request was
 
     def __init__(
         self, endpoint: str, *, sent: SentAttitudes = AS_SENT, **options: Unpack[SocketOptions]
     ) -> None:
-        self.conventions = sent.conventions
         self._decode = sent.decoder(wire.decode)
-        options.setdefault("bind", True)
-        super().__init__(zmq.REP, endpoint, **options)
+        super().__init__(ZmqReply(endpoint, **options), sent.conventions)
 
     def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next request for a frame, or None; it must be answered before the next can arrive.
 
-        Time requests are answered here. libzmq announces a request without its delimiter, then
-        drops it: none is waited for.
+        Time requests are answered here.
         """
-        if self._waits(timeout_ms):
-            message = self._take()
-        else:
-            message = None
-        if message is None:
+        request = self._road.request(timeout_ms)
+        if request is None:
             return None
-        host_ns = self._clock.now_ns()
+        host_ns = request.host_ns
+        message = request.parts[-1]
         event = self._decode(message)
         if isinstance(event, wire.TimeRequest):
-            self._answer(
-                wire.encode(
-                    wire.TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())
-                )
+            now_ns = self._clock.now_ns()
+            self._road.put(
+                wire.encode(wire.TimeReply(event.sequence, event.t1_ns, host_ns, now_ns))
             )
             return None
         self._json = message[:64].lstrip()[:1] == b"{"
@@ -279,19 +278,14 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
     def answer(self, status: wire.Status, shown_ns: int, refusal: wire.Refusal | None) -> None:
         """Answer the request: with a status packet for a packet, with an object for JSON."""
         if not self._json:
-            self._answer(wire.encode(status))
+            self._road.put(wire.encode(status))
             return
         fields = {name: getattr(status, name) for name in status.__dataclass_fields__}
         if refusal is None:
             trouble = None
         else:
             trouble = {"reason": refusal.reason, "detail": refusal.detail}
-        self._answer(msgspec.json.encode({**fields, "shown_ns": shown_ns, "refused": trouble}))
-
-    def _answer(self, message: bytes) -> None:
-        """A peer that is gone, or does not read, gets no answer."""
-        with contextlib.suppress(zmq.Again):
-            self._ready().send(message, zmq.NOBLOCK)
+        self._road.put(msgspec.json.encode({**fields, "shown_ns": shown_ns, "refused": trouble}))
 
 
 class Feed(Closing):
@@ -336,4 +330,4 @@ class FedDecoder(PacketDecoder):
             return super()._arrival(message)
         (came_ns,) = STAMP.unpack(message.parts[0])
         raw = message.parts[1]
-        return Arrival(came_ns, self.decode(raw), raw)
+        return Arrival(came_ns, self.event(raw), raw)

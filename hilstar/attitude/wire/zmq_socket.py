@@ -15,8 +15,9 @@ import os
 import resource
 import socket
 import struct
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, TypedDict, Unpack
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple, TypedDict, Unpack
 
 import zmq
 
@@ -29,7 +30,14 @@ from hilstar.attitude.wire.keys import (
     load_public,
     load_secret,
 )
-from hilstar.attitude.wire.links import CLIENT_REJECTED, PAUSE_S, WRONG_PEER, Link, LinkCounts
+from hilstar.attitude.wire.roads import (
+    ATTITUDES,
+    PAUSE_S,
+    ByteRoad,
+    LinkCounts,
+    RawMessage,
+    RoadUse,
+)
 from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -39,6 +47,9 @@ from hilstar.basics.units import NS_PER_MS
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
+CLIENT_REJECTED = "client-rejected"  # the notice that a connection to a socket that binds was none
+WRONG_PEER = "link-rejected"  # the notice that something else than a sender is at the other side
+MAX_TAKEN_BYTES = 8_000_000  # in one go
 MAX_GROWTH_BYTES = 256_000_000
 LOOK_S = 0.01
 FREED_WITHIN_S = 2.0
@@ -47,6 +58,11 @@ WANTED_FILES = 65_536
 MAX_CONNECTIONS = 64
 MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50  # in one go; after more the link pauses, so that a flood is read at a bounded rate
+SENDER = replace(
+    ATTITUDES,
+    lost_line="lost the connection to the sender; waiting for it",
+    back_line="reconnected to the sender",
+)
 # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 EVENT = struct.Struct("=Hi")
 HANDSHAKE_MS = 2000  # peers that never finish it would take up all MAX_CONNECTIONS
@@ -149,6 +165,13 @@ def _raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+class ConnectionsTold(NamedTuple):
+    """Who is told that a connection that we made has had its handshake, and why it ended."""
+
+    opened: Callable[[], None]
+    lost: Callable[[str], None]
+
+
 class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
@@ -164,6 +187,7 @@ class _Doorkeeper:
         *,
         look: PeerLook | None,
         counts: LinkCounts,
+        told: ConnectionsTold,
         notices: Notices,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
@@ -173,6 +197,7 @@ class _Doorkeeper:
         self._watched = watched
         self._look = look
         self._counts = counts
+        self._told = told
         self._notices = notices
         self._clock = clock
         self._bound = look is None
@@ -226,10 +251,7 @@ class _Doorkeeper:
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._greeted = True
             self._counts.connections += 1
-            if self._counts.connections > 1:
-                self._notices.tell("back", "reconnected to the sender")
-            else:
-                self._notices.mention("connected", "connected to the sender")
+            self._told.opened()
         elif event in FAILED:
             self._failure = FAILED[zmq.Event(event)]
 
@@ -263,8 +285,7 @@ class _Doorkeeper:
             self._counts.rejected += 1
             self._look.begin()
         else:
-            self._counts.lost += 1
-            self._notices.tell("lost", "lost the connection to the sender; waiting for it")
+            self._told.lost("the other side closed it")
 
     def _tell_look(self) -> None:
         trouble = "" if self._look is None else self._look.take()
@@ -320,7 +341,7 @@ def zmq_version() -> str:
 
 class SocketOptions(TypedDict, total=False):
     """How a socket is opened: whether it binds, whose keys it has, who hears of it, its largest
-    part, and the clock.
+    part, the clock, and what it is for.
     """
 
     bind: bool
@@ -328,10 +349,13 @@ class SocketOptions(TypedDict, total=False):
     notices: Notices | None
     max_part_bytes: int
     clock: HostClock
+    use: RoadUse
 
 
-class ZmqSocket(Link):
+class ZmqSocket(ByteRoad):
     """A socket and its context, bound or connected; reopened after a flood.
+
+    Only what it connects to is lost and comes back: to one that binds, any number connect.
 
     A socket that binds is opened at once, to check that it can be. One that receives a stream is
     then closed until its first read, so that no old messages and no flood collect in it while the
@@ -339,15 +363,17 @@ class ZmqSocket(Link):
     would leave its sender waiting for ever.
     """
 
+    messages = True
+
     def __init__(self, kind: int, endpoint: str, **options: Unpack[SocketOptions]) -> None:
-        super().__init__(options.get("notices"), options.get("clock", HOST_CLOCK))
+        clock = options.get("clock", HOST_CLOCK)
+        super().__init__(endpoint, options.get("use", SENDER), options.get("notices"), clock)
         self._max_part_bytes = options.get("max_part_bytes", MAX_PART_BYTES)
         bind = options.get("bind", False)
         keys = options.get("keys", NO_KEYS)
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
-        self.endpoint = endpoint
         self.verb = "bound to" if bind else "connected to"
         self._kind, self._bind, self._address = kind, bind, self._place.address
         self._keys = keys
@@ -388,7 +414,12 @@ class ZmqSocket(Link):
         else:
             look = PeerLook(self._address, kind, keys=self._pair is not None)
         self._keeper = _Doorkeeper(
-            made, look=look, counts=self.link_counts, notices=self._notices, clock=self._clock
+            made,
+            look=look,
+            counts=self.link_counts,
+            told=ConnectionsTold(self._opened, self._lose),
+            notices=self._notices,
+            clock=self._clock,
         )
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
@@ -444,6 +475,39 @@ class ZmqSocket(Link):
             self._memory.begin()
             return self._open()
         return self._socket
+
+    @property
+    def bound(self) -> bool:
+        """Whether others connect to it."""
+        return self._bind
+
+    @property
+    def trouble(self) -> str:
+        """See `ByteRoad.trouble`: what is there in the place of a partner."""
+        return trouble_of(self.link_counts, self._notices)
+
+    def _opened(self) -> None:
+        super()._opened()
+        if self.openings == 1:
+            self._notices.mention("connected", "connected to the sender")
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The waiting messages, oldest first; see `ByteRoad.taken`."""
+        if not self._waits(timeout_ms):
+            return []
+        waiting: list[RawMessage] = []
+        taken_bytes = 0
+        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES:
+            parts = self._take_parts()
+            if parts is None:
+                break
+            waiting.append(RawMessage(self._clock.now_ns(), parts))
+            taken_bytes += sum(map(len, parts))
+        return waiting
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once a message waits."""
+        return self._waits(timeout_ms)
 
     def _waits(self, timeout_ms: float) -> bool:
         """True once a message waits; connections and memory are checked meanwhile."""
@@ -502,6 +566,13 @@ class ZmqSocket(Link):
         self._reset(f"a message of more than {passed_over or MAX_PARTS} parts")
         return None
 
+    def _put(self, parts: list[bytes]) -> bool:
+        """Send one message, never waiting; False where no peer takes it."""
+        with contextlib.suppress(zmq.Again):
+            self._ready().send_multipart(parts, zmq.NOBLOCK)
+            return True
+        return False
+
     def _reset(self, why: str) -> None:
         """Drop every connection, and what libzmq keeps of it."""
         self.link_counts.resets += 1
@@ -526,6 +597,46 @@ class ZmqSocket(Link):
             self._authenticator.stop()
         self._context.term()
         self._memory.close()
+
+
+class ZmqReply(ZmqSocket):
+    """A REP socket: each request gets one reply before the next can arrive; it binds, or connects
+    with `bind=False`.
+    """
+
+    def __init__(self, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+        options.setdefault("bind", True)
+        super().__init__(zmq.REP, endpoint, **options)
+
+    def request(self, timeout_ms: int) -> RawMessage | None:
+        """The next request, or None; waits at most `timeout_ms`.
+
+        libzmq announces a request without its delimiter, then drops it: none is waited for.
+        """
+        parts = self._take_parts() if self._waits(timeout_ms) else None
+        return None if parts is None else RawMessage(self._clock.now_ns(), parts)
+
+    def put(self, data: bytes, patience_s: float = 0.0) -> bool:
+        """Reply; a peer that is gone, or does not read, gets none."""
+        return self._put([data])
+
+    def put_parts(self, parts: list[bytes]) -> bool:
+        """Reply with a message of several parts."""
+        return self._put(parts)
+
+
+def trouble_of(counts: LinkCounts, notices: Notices) -> str:
+    """Why a socket of these counts gives no messages, as far as its notices say; "" where they do
+    not.
+    """
+    wrong_peer = notices.latest(WRONG_PEER)
+    if wrong_peer:
+        return "" if counts.connections else wrong_peer
+    # who binds counts connections from their begin on, so also those that it then rejects
+    is_alone = counts.connections <= counts.rejected
+    if is_alone:
+        return notices.latest(CLIENT_REJECTED)
+    return ""
 
 
 def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:

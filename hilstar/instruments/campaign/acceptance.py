@@ -10,11 +10,12 @@ import functools
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from hilstar.basics.charts import write_csv
+from hilstar.basics.errors import MachineError, one_line
 from hilstar.basics.files import write_whole
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
@@ -28,7 +29,7 @@ from hilstar.instruments.campaign.requirements import (
 from hilstar.instruments.campaign.results import Columns, read_cases
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
-from hilstar.instruments.campaign.store import Directory, failures
+from hilstar.instruments.campaign.store import Directory, failures, require_parquet
 from hilstar.instruments.campaign.sweep import LevelCount, counted, edge_figure, next_level
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
@@ -94,6 +95,8 @@ class Acceptance:
         self._solver = solver
         self._timeout_s = timeout_s
         self.on_bench = plan.through == "bench"
+        self.sets = plan.sets
+        require_parquet()
         self.certificate: Certificate | None = None
         if self.on_bench:
             self.certificate = bench_certificate(self.file)
@@ -105,20 +108,30 @@ class Acceptance:
         return Campaign(path, folder, self._solver, self._timeout_s, False, text=text)
 
     def check(self) -> None:
-        """Refuse (InputError) sets whose campaigns could not run, before the first case."""
-        for case_set in self.plan.sets:
-            if not case_set.refused:
-                folder = self.directory / case_set.name
-                start = case_set.sweep.start if case_set.sweep is not None else None
-                campaign = self.campaign(case_set, folder, start)
-                requires = [clause.require for clause in self.plan.clauses_of(case_set.name)]
-                campaign.check_conditions(requires)
+        """Refuse (InputError) sets whose campaigns could not run, before the first case. What this
+        machine lacks for a set leaves that out.
+        """
+        self.sets = tuple(self._checked(case_set) for case_set in self.plan.sets)
+
+    def _checked(self, case_set: CaseSet) -> CaseSet:
+        """The set, with why it cannot run here."""
+        if case_set.refused:
+            return case_set
+        start = case_set.sweep.start if case_set.sweep is not None else None
+        try:
+            campaign = self.campaign(case_set, self.directory / case_set.name, start)
+        except MachineError as error:
+            return replace(case_set, refused=one_line(str(error)))
+        campaign.check_conditions(
+            [clause.require for clause in self.plan.clauses_of(case_set.name)]
+        )
+        return case_set
 
     def costs(self, workers: int) -> Iterator[CostOfSet]:
         """How long each set takes, by the time of its first cases; on a bench, by its timeout at
         most.
         """
-        for case_set in self.plan.sets:
+        for case_set in self.sets:
             if case_set.refused:
                 continue
             sweep = case_set.sweep
@@ -134,7 +147,7 @@ class Acceptance:
         """Run what is missing of each set, in the plan's order."""
         write_whole(self.directory / PLAN_FILE, self.plan.text)
         results = []
-        for case_set in self.plan.sets:
+        for case_set in self.sets:
             result = SetResult(case_set)
             folder = self.directory / case_set.name
             if not case_set.refused and case_set.sweep is None:

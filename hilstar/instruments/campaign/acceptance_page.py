@@ -24,7 +24,6 @@ from hilstar.basics.pages import (
     page_of,
     paragraph,
     table_of,
-    within,
 )
 from hilstar.basics.version import __version__
 from hilstar.instruments.campaign.acceptance import (
@@ -34,17 +33,19 @@ from hilstar.instruments.campaign.acceptance import (
     ClauseVerdict,
     SetResult,
 )
-from hilstar.instruments.campaign.figures import clopper_pearson, quantile_limits
+from hilstar.instruments.campaign.answer_figures import StarTable, place_map
+from hilstar.instruments.campaign.figures import TooFewCases, clopper_pearson, quantile_limits
+from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import SIGN, SIGN_STYLE, STATES
 from hilstar.instruments.campaign.store import file_sha256
-from hilstar.instruments.campaign.sweep import levels_text
+from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, levels_text
 from hilstar.server.bench.certificate_file import off_by
 
 PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
 HEADER = (
     *("capability", "requirement", "measured (interval)", "guard band", "margin", "verdict"),
-    *("cases", "to show it", "method"),
+    *("cases", "to show it"),
 )
 CSV_COLUMNS = (
     *("capability", "of", "quantity", "axis", "condition", "limit", "side", "unit", "confidence"),
@@ -67,6 +68,8 @@ METHOD = (
 )
 FAILED_HEADER = ("set of cases", "failed", "why")
 FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
+GRID = 8  # arrows along each side of the map of place errors
+MAG_BINS = 12
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 MAX_ROWS = 5000  # of points in a chart
 
@@ -186,25 +189,47 @@ def _more(each: ClauseVerdict) -> str:
 
 
 def _requirement(each: ClauseVerdict) -> str:
-    words = each.clause.require.words
-    if each.clause.quantity == "edge" and each.unit:
-        return f"{words} {each.unit}"
-    return words
+    """The limit in words, without the quantity, which the capability names."""
+    require = each.clause.require
+    side = "at most" if require.minimum is None else "at least"
+    share = f" in {100 * require.share:g} % of cases" if require.share else ""
+    where = f" where {require.condition}" if require.condition else ""
+    limit = f"{require.limit:g} {each.unit}".rstrip()
+    return f"{side} {limit}{share}{where}"
 
 
 def _measured(each: ClauseVerdict) -> str:
+    """The figure with its interval."""
     verdict = each.verdict
     if verdict is None or verdict.value is None:
         return DASH
-    low, high = verdict.low, verdict.high
-    if low is not None and high is not None:
-        return within(verdict.value, low, high, each.unit)
-    ends = [f"{_end(low)} to {_end(high)}"]
-    return f"{verdict.value:.4g} ({ends[0]}) {each.unit}".rstrip()
+    if each.clause.quantity == "edge" and None in (verdict.low, verdict.high):
+        for end in (STILL, NOT_EVEN):
+            if end in verdict.method:
+                return f"{end} {_digits(verdict.value)} {each.unit}".rstrip()
+    low, high = (_digits(end) for end in (verdict.low, verdict.high))
+    return f"{_digits(verdict.value)} ({low} to {high}) {each.unit}".rstrip()
 
 
-def _end(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.4g}"
+def _digits(value: float | None) -> str:
+    """Three digits; large whole numbers without an exponent."""
+    if value is None:
+        return "unknown"
+    if abs(value) >= 1000:
+        return f"{float(f'{value:.3g}'):.0f}"
+    return f"{value:.3g}"
+
+
+def _margin(each: ClauseVerdict) -> str | None:
+    """How far the limit is kept, and that as a share of it, where that is at most all."""
+    verdict = each.verdict
+    if verdict is None or verdict.margin is None:
+        return None
+    limit = abs(each.clause.limit)
+    share = ""
+    if abs(verdict.margin) <= limit:
+        share = f" ({100 * verdict.margin / limit:.0f} %)"
+    return f"{_digits(verdict.margin)} {each.unit}".rstrip() + share
 
 
 def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
@@ -234,8 +259,10 @@ def _cards(
     for result in results:
         if result.levels:
             yield _sweep_card(result)
-        elif _asked(verdicts, result, "time-to-first-attitude"):
+        elif _asked(verdicts, result, ("time-to-first-attitude",)):
             yield _first_attitude(result)
+        elif _asked(verdicts, result, STAR_QUANTITIES):
+            yield from _star_card(acceptance, result)
     yield _about(acceptance, results, rows)
     names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
     yield Card("Signed", words=[names])
@@ -247,26 +274,29 @@ def _failed_rows(result: SetResult) -> Iterator[tuple[str, int, str]]:
         yield result.case_set.name, count, why
 
 
-def _asked(verdicts: list[ClauseVerdict], result: SetResult, quantity: str) -> bool:
+def _asked(verdicts: list[ClauseVerdict], result: SetResult, quantities: tuple[str, ...]) -> bool:
+    """Whether a clause limits one of these quantities of a set."""
     name = result.case_set.name
     return result.cases is not None and any(
-        each.clause.of == name and each.clause.quantity == quantity for each in verdicts
+        each.clause.of == name and each.clause.quantity in quantities for each in verdicts
     )
 
 
 def _clauses(verdicts: list[ClauseVerdict]) -> Card:
-    rows = []
+    rows, methods = [], []
     for each in verdicts:
         verdict = each.verdict
         if verdict is None:
             continue
         chip = f'<span class="chip" data-state="{STATES[each.word]}">{each.word}</span>'
         guard = f"{verdict.guard:.2g} {each.unit}" if verdict.guard else ""
-        margin = None if verdict.margin is None else f"{verdict.margin:.3g} {each.unit}".rstrip()
-        figures = (_requirement(each), _measured(each), guard, margin, Markup(chip))
-        rows.append((each.clause.capability, *figures, verdict.cases, _more(each), verdict.method))
+        figures = (_requirement(each), _measured(each), guard, _margin(each), Markup(chip))
+        rows.append((each.clause.capability, *figures, verdict.cases, _more(each)))
+        methods.append((each.clause.capability, each.clause.quantity, verdict.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
-    return Card("Clauses", words=texts, cure=CURES.get(verdict_of(verdicts), ""))
+    how = table_of(methods, ("capability", "quantity", "method"))
+    cure = CURES.get(verdict_of(verdicts), "")
+    return Card("Clauses", words=texts, cure=cure, details=[how])
 
 
 def _untested(acceptance: Acceptance, verdicts: list[ClauseVerdict]) -> Card:
@@ -324,6 +354,46 @@ def _first_attitude(result: SetResult) -> Card:
     words = [drawing_of(axes.figure, "distribution of the time to the first attitude")]
     words.append(table_of(rows, header))
     return Card(f"Time to the first attitude: {result.case_set.name}", words=words)
+
+
+def _detection(found: StarTable) -> Iterator[tuple[float, float, float, float]]:
+    """Of bins of magnitude: middle, share of stars reported, and 95 % below and above that."""
+    edges = np.linspace(float(found.v_mag.min()), float(found.v_mag.max()) + 1e-6, MAG_BINS + 1)
+    place = np.digitize(found.v_mag, edges) - 1
+    for k in range(MAG_BINS):
+        lit = int((place == k).sum())
+        if not lit:
+            continue
+        seen = int((found.found & (place == k)).sum())
+        low, high = clopper_pearson(seen, lit, 0.975)
+        share = seen / lit
+        yield float(edges[k] + edges[k + 1]) / 2, share, share - low, high - share
+
+
+def _star_card(acceptance: Acceptance, result: SetResult) -> Iterator[Card]:
+    """Detection against magnitude, and the map of stars' place errors; none without stars."""
+    assert result.cases is not None
+    try:
+        found = StarTable.of(result.cases)
+        offsets_px = place_map(found, acceptance.scale.resolution_px, GRID)
+    except TooFewCases:
+        return
+    at, share, below, above = np.array(list(_detection(found))).T
+    largest_px = float(np.hypot(offsets_px.dx_px, offsets_px.dy_px).max())
+    finding = f"Stars reported by magnitude; their places are off by at most {largest_px:.2g} px"
+    with panels_of(finding, 1, 2, share_x=False, height_inch=3.6) as (left, right):
+        left.errorbar(at, share, yerr=[below, above], fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
+        left.set_ylim(-0.05, 1.05)
+        left.set_xlabel("V [mag]")
+        left.set_ylabel("share reported")
+        arrows = (offsets_px.x_px, offsets_px.y_px, offsets_px.dx_px, offsets_px.dy_px)
+        right.quiver(*arrows, angles="xy", color=BLUE)
+        right.set_xlabel("x [px]")
+        right.set_ylabel("y [px]")
+        right.invert_yaxis()
+        right.set_aspect("equal")
+    drawing = drawing_of(left.figure, "detection against magnitude, and the map of place errors")
+    yield Card(f"Single stars: {result.case_set.name}", words=[drawing])
 
 
 def _seconds(value: float) -> str:

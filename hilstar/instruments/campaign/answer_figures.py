@@ -93,8 +93,8 @@ def answer_figure(
         return _aberration(require, cases)
     found = StarTable.of(cases)
     figures: dict[str, Callable[[], BoundedFigure]] = {
-        "star-noise": lambda: _star_places(require, found, resolution_px, rng, noise=True),
-        "star-fov-error": lambda: _star_places(require, found, resolution_px, rng, noise=False),
+        "star-noise": lambda: _star_noise(require, found, resolution_px, rng),
+        "star-fov-error": lambda: _star_map(require, found, resolution_px, rng),
         "star-colour": lambda: _star_colour(require, found),
         "star-limit": lambda: _star_limit(require, found, rng),
         "false-stars": lambda: _false_stars(require, cases, rng),
@@ -321,54 +321,98 @@ class StarTable:
         return np.isfinite(self.dx_px)
 
 
-def _star_places(
-    require: Require,
-    found: StarTable,
-    resolution_px: tuple[int, int],
-    rng: np.random.Generator,
-    *,
-    noise: bool,
-) -> BoundedFigure:
-    """The noise of stars' places, or the rms of their map, px an axis."""
+@dataclass(frozen=True, slots=True)
+class PlaceFit:
+    """The map of stars' place errors: polynomials (terms, 2), the stars in it (n,) by their case,
+    their errors by the map and the residuals (n, 2), px.
+    """
+
+    solution: FloatArray
+    case: IntArray
+    fitted_px: FloatArray
+    residual_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceOffsets:
+    """Places (n,) on the detector and how far reported stars are off there, px."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    dx_px: FloatArray
+    dy_px: FloatArray
+
+
+def fitted_places(found: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
+    """The map of reported stars' place errors; wild ones do not count. Raises TooFewCases."""
     kept = np.flatnonzero(found.found)
     offsets = np.stack([found.dx_px, found.dy_px], axis=1)[kept]
     terms = field_terms(found.x_px[kept], found.y_px[kept], resolution_px, MAP_DEGREE)
+    needed = 4 * terms.shape[1]
     near = np.ones(len(kept), dtype=np.bool_)
     for _ in range(3):
-        if near.sum() < 4 * terms.shape[1]:
-            more = 4 * terms.shape[1]
-            raise TooFewCases(f"{int(near.sum())} stars, and {more} are needed for a map", 0)
-        solution = np.linalg.lstsq(terms[near], offsets[near], rcond=None)[0]
+        if near.sum() < needed:
+            raise TooFewCases(f"{int(near.sum())} stars, and {needed} are needed for a map", 0)
+        found_terms = np.linalg.lstsq(terms[near], offsets[near], rcond=None)[0]
+        solution = np.asarray(found_terms, dtype=np.float64)
         residual = offsets - terms @ solution
         spread = MAD_TO_SIGMA * np.median(np.abs(residual[near]), axis=0)
         close = np.abs(residual) <= WILD_SIGMAS * np.maximum(spread, 1e-9)
         near = np.asarray(close.all(axis=1), dtype=np.bool_)
-    count = int(near.sum())
-    freedom = count - terms.shape[1]
-    case = found.case[kept][near]
-    number = np.unique(case, return_inverse=True)[1].reshape(-1)
-    variance = float((residual[near] ** 2).sum()) / (2 * freedom)
-    method = f"map of degree {MAP_DEGREE} over {count} stars, bootstrap over cases"
-    if noise:
-        squares = (residual[near] ** 2).mean(axis=1) * count / freedom
-        return _root_mean(squares, np.ones(count), case, require, rng, method)
     fitted = terms[near] @ solution
-    fitted = fitted - fitted.mean(axis=0)
+    return PlaceFit(solution, found.case[kept][near], fitted, residual[near])
+
+
+def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> PlaceOffsets:
+    """The map at `side` by `side` places of the detector, less its mean. Raises TooFewCases."""
+    fit = fitted_places(found, resolution_px)
+    places = [(np.arange(side) + 0.5) * length / side for length in resolution_px]
+    x_px, y_px = (part.ravel() for part in np.meshgrid(*places))
+    offsets = field_terms(x_px, y_px, resolution_px, MAP_DEGREE) @ fit.solution
+    offsets = offsets - offsets.mean(axis=0)
+    return PlaceOffsets(x_px, y_px, offsets[:, 0], offsets[:, 1])
+
+
+def _star_noise(
+    require: Require, found: StarTable, resolution_px: tuple[int, int], rng: np.random.Generator
+) -> BoundedFigure:
+    """The noise of stars' places about their map, px an axis."""
+    fit = fitted_places(found, resolution_px)
+    count = len(fit.case)
+    freedom = count - len(fit.solution)
+    squares = (fit.residual_px**2).mean(axis=1) * count / freedom
+    return _root_mean(squares, np.ones(count), fit.case, require, rng, _map_method(count))
+
+
+def _map_method(stars: int) -> str:
+    return f"map of degree {MAP_DEGREE} over {stars} stars, bootstrap over cases"
+
+
+def _star_map(
+    require: Require, found: StarTable, resolution_px: tuple[int, int], rng: np.random.Generator
+) -> BoundedFigure:
+    """The rms of the map of stars' places, px an axis."""
+    fit = fitted_places(found, resolution_px)
+    count = len(fit.case)
+    terms = len(fit.solution)
+    variance = float((fit.residual_px**2).sum()) / (2 * (count - terms))
+    fitted = fit.fitted_px - fit.fitted_px.mean(axis=0)
     # what the noise alone puts into so many terms
-    taken = variance * (terms.shape[1] - 1) / count
+    taken = variance * (terms - 1) / count
+    number = np.unique(fit.case, return_inverse=True)[1].reshape(-1)
     sums = _summed((fitted**2).mean(axis=1), number)
     counts = _summed(np.ones(count), number)
     low, high = drawn_limits(sums, counts, rng, require.confidence)
     power = float(sums.sum() / counts.sum()) - taken
     # the spread of the fit's own power by noise: each term has one degree of freedom an axis
-    free = 2 * (terms.shape[1] - 1)
+    free = 2 * (terms - 1)
     hidden = float(stats.norm.ppf(require.confidence)) * taken * math.sqrt(2 / free)
     hidden += 2 * math.sqrt(max(power, 0.0) * variance / (2 * count))
     upper = max(float(high) - taken, power) + hidden
     lower = min(float(low) - taken, power) - hidden
     value = math.sqrt(max(power, 0.0))
     limits = math.sqrt(max(lower, 0.0)), math.sqrt(max(upper, 0.0))
-    return BoundedFigure(value, *limits, len(counts), method)
+    return BoundedFigure(value, *limits, len(counts), _map_method(count))
 
 
 def _star_colour(require: Require, found: StarTable) -> BoundedFigure:

@@ -181,16 +181,14 @@ class Tally:
     frames_told: FrameLists = field(default_factory=FrameLists)
     star_lists: StarLists = field(default_factory=StarLists)
 
-    def take(self, judged: Judged, right: bool) -> None:
-        """Take an answer into the case's figures."""
+    def take(self, judged: Judged, right: bool, rate_rad_s: FloatArray) -> None:
+        """Take an answer into the case's figures; `rate_rad_s` is what its exposure turned at."""
         self.received += 1
         if judged.residual is None:
             return
         if right:
             self.errors.append(judged.residual)
-            if judged.lit is not None:
-                reported_rad_s = judged.answer.rate_cam_rad_s
-                self.frames_told.add(judged.lit.rate_rad_s, judged.residual, reported_rad_s)
+            self.frames_told.add(rate_rad_s, judged.residual, judged.answer.rate_cam_rad_s)
         else:
             self.wrong += 1
             self.worst_deg = max(
@@ -413,6 +411,7 @@ class BenchRun:
             }
             rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
             told |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
+            told |= {"acceleration_cam_rad_s2": now.case.acceleration_rad_s2.tolist()}
             write_whole(
                 self._now_path,
                 msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}),
@@ -483,7 +482,9 @@ class BenchRun:
         else:
             settled = after_s >= plan.settle_s
         if settled and now.received < plan.asked:
-            now.take(judged, right)
+            # what was commanded: the lit frames tell it only as well as their times are known
+            view = self._view(judged.middle_ns) or now.case.first
+            now.take(judged, right, view.turn.rate_cam_rad_s)
             if right and "stars" in plan.columns and judged.lit is not None:
                 now.star_lists.judged.append(self._judged_stars(answer, judged.lit.q))
 

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
@@ -35,15 +35,21 @@ from hilstar.instruments.campaign.plan import (
     parameters,
 )
 from hilstar.instruments.campaign.store import Row
-from hilstar.instruments.simulate.batch import faulty_exposure, view_at
+from hilstar.instruments.simulate.exposures import faulty_exposure, view_at
 from hilstar.instruments.simulate.simulator import FaultyExposure, Simulator
 from hilstar.optics.frame_motion import CameraTurn
+from hilstar.optics.layers.fault_kinds import Fault, fault_of
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import BenchFile, dated, stated_in
 from hilstar.server.bench.scenario import Scenario, read_scenario
+from hilstar.server.bench.star_light import bench_moving
 
-ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
+ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1, "body": 3}
 MAX_STEP_S = 0.01  # of a turn that accelerates
+STRAY, STRAY_DEG, STRAY_FROM_S = "stray_e_per_px", 80.0, -1e5
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
 # what varies on a real bench
@@ -55,6 +61,7 @@ ON_BENCH = (
     "acceleration_deg_s2",
     "time_s",
     "scenario",
+    "body_deg",
 )
 Kind = Literal["int64", "float64", "bool", "text", "floats"]
 
@@ -177,7 +184,10 @@ class CaseMaker:
             if name
         ]
         self._scenarios = {name: read_scenario(folder / name) for name in named}
+        self._skies: dict[str, MovingSky | None] = {}
         _check_through(plan, self.parameters, file)
+        if plan.attitudes.body is not None:  # so that a body that is not there is refused here
+            self.case(0, np.full(self.attitude_dimensions + len(self.parameters), 0.5))
 
     @property
     def attitude_dimensions(self) -> int:
@@ -249,8 +259,15 @@ class CaseMaker:
         return 0 if self._log is None else self._log.span_ns[0]
 
     def scenario(self, case: Case) -> Scenario | None:
-        """The case's scenario."""
-        return self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        """The case's scenario, its stray light among the faults."""
+        scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        stray_e = float(case.values.get(STRAY, 0.0))
+        if stray_e <= 0:
+            return scenario
+        glow = stray_light(stray_e, self.file)
+        if scenario is None:
+            return Scenario(Path(), "", case.noise_seed, (glow,))
+        return dataclasses.replace(scenario, faults=(*scenario.faults, glow))
 
     def fault_end_s(self, case: Case, length_s: float) -> float | None:
         """When the last fault of the case's scenario ends, after the case's begin; None outside
@@ -280,7 +297,33 @@ class CaseMaker:
                 t_ns,
             )
         t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
-        return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
+        if self.plan.attitudes.body is None:
+            q = looking_q(self.plan.attitudes, look)
+        else:
+            q = self._beside_body(self.plan.attitudes, look, values, t_ns)
+        return View.exposure(q, rate_rad_s, 0.0, t_ns)
+
+    def _beside_body(
+        self, attitudes: Attitudes, look: FloatArray, values: dict[str, Any], t_ns: int
+    ) -> FloatArray:
+        """`q_icrs_to_cam` (4,) at the case's angle from a body, on any side of it. Raises
+        InputError where the bench has no such body.
+        """
+        file = changed_bench(self.file, self._tables, values)
+        if file.sha256 not in self._skies:
+            self._skies = {file.sha256: bench_moving(file.config, file.folder)}
+        moving = self._skies[file.sha256]
+        discs = [] if moving is None else moving.discs(np.eye(3)[2], math.pi, t_ns=t_ns)
+        disc = next((disc for disc in discs if disc.name.lower() == attitudes.body), None)
+        if disc is None:
+            raise InputError(
+                f'[attitudes] body = "{attitudes.body}": the bench has none; write [sky] epoch_utc'
+                f" and [sky.bodies] {attitudes.body} = true, or vary sky.bodies.{attitudes.body}"
+            )
+        off_rad = math.radians(float(values.get("body_deg", 0.0)))
+        low_deg, high_deg = attitudes.roll_deg
+        roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
+        return beside_q(disc.direction, off_rad, 2 * math.pi * float(look[0]), roll_deg)
 
 
 def accelerated(
@@ -309,17 +352,33 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
             360 * float(look[0]), math.degrees(math.asin(2 * float(look[1]) - 1)), roll_deg
         )
     off = math.acos(1 - float(look[1]) * (1 - math.cos(math.radians(attitudes.radius_deg))))
-    angle = 2 * math.pi * float(look[0])
     ra, dec = (math.radians(degrees) for degrees in attitudes.radec_deg)
+    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    return beside_q(middle, off, 2 * math.pi * float(look[0]), roll_deg)
+
+
+def beside_q(middle: FloatArray, off: float, angle: float, roll_deg: float) -> FloatArray:
+    """`q_icrs_to_cam` (4,) with the boresight `off` (rad) from an ICRS direction (3,), at a
+    position angle (rad) from north to east.
+    """
+    ra, dec = math.atan2(middle[1], middle[0]), math.asin(max(-1.0, min(1.0, float(middle[2]))))
     east = np.array([-math.sin(ra), math.cos(ra), 0.0])
     north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
-    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
     x, y, z = math.cos(off) * middle + math.sin(off) * (
         math.sin(angle) * east + math.cos(angle) * north
     )
     return from_radec_roll_deg(
         math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg
     )
+
+
+def stray_light(electrons: float, file: BenchFile) -> Fault:
+    """Even light over the tracker's detector: a glow that is far wider than any field."""
+    width, height = file.config.tracker.resolution_px
+    middle = [(width - 1) / 2, (height - 1) / 2]
+    table = {"name": "stray light", "kind": "glow", "scale_deg": STRAY_DEG, "tracker_px": middle}
+    # on before the first exposure begins, half of which is before the case's begin
+    return fault_of(table | {"electrons": electrons, "at_s": STRAY_FROM_S})
 
 
 def _read_log(path: Path, file: BenchFile) -> _Log:
@@ -366,7 +425,7 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             raise InputError(
                 '[[vary]] key = "time_s": with a log the times are the log\'s; leave it out'
             )
-        if plan.through == "display" and parameter.key == SCENARIO:
+        if plan.through == "display" and parameter.key in (SCENARIO, STRAY):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": faults are of through = "tracker"; write that'
             )

@@ -58,12 +58,14 @@ OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
-    *("time_s", "noise_seed", "scenario"),
+    *("time_s", "noise_seed", "scenario", "body_deg", "stray_e_per_px"),
 )
 MAX_OWN = {
     "rate_deg_s": 360.0,
     "acceleration_deg_s2": 360.0,
     "misalignment_arcsec": 36_000.0,
+    "body_deg": 180.0,
+    "stray_e_per_px": 1e9,
     "time_s": 9e9,
     "noise_seed": 2.0**63 - 1,
 }
@@ -129,10 +131,11 @@ TRACKER_PSF = "tracker"
 
 class Attitudes(Table, frozen=True):
     """[attitudes]: where the cases look. `field` is a cap of `radius_deg` around `radec_deg`;
-    `log` goes along a log.
+    `log` goes along a log; `body` looks at the angle `body_deg` of the case from a `body`.
     """
 
-    kind: Literal["all-sky", "field", "log"] = "all-sky"
+    kind: Literal["all-sky", "field", "log", "body"] = "all-sky"
+    body: Literal["sun", "moon", "earth"] | None = None
     radec_deg: tuple[Ra, Dec] | None = None
     radius_deg: Annotated[float, Meta(ge=0, le=180)] = 5.0
     roll_deg: tuple[Roll, Roll] = (0.0, 360.0)
@@ -232,6 +235,7 @@ class PlantedFaults(Table, frozen=True):
     acquisition_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     recovery_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     max_rate_deg_s: Annotated[float, Meta(ge=0, le=1e6)] | None = None
+    exclusion_deg: Annotated[float, Meta(ge=0, le=180)] = 0.0
     max_false_stars: Annotated[int, Meta(ge=0, le=100_000)] | None = None
     rate_bias_deg_s: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     rate_noise_deg_s: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -346,6 +350,11 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         raise InputError('[attitudes] kind = "field" needs radec_deg = [RA, DEC]; add it')
     if attitudes.kind == "log" and attitudes.log is None:
         raise InputError('[attitudes] kind = "log" needs log = "FILE"; add it')
+    if (attitudes.kind == "body") != (attitudes.body is not None):
+        raise InputError(
+            '[attitudes] kind = "body" and body = "sun", "moon" or "earth" go together; write both,'
+            " or neither"
+        )
     if attitudes.kind != "field" and attitudes.radec_deg is not None:
         raise InputError(
             f'[attitudes] radec_deg is for kind = "field", and kind is "{attitudes.kind}"; write'
@@ -512,19 +521,22 @@ class Parameter:
 
 
 def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
-    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError
-    as the file does.
+    """The plan's parameters, each tried in the bench file at its ends, with those before it that
+    have one value alone. Raises InputError as the file does.
     """
     tables = parse_toml(file.path, file.text)
     parameter_list = []
+    fixed: dict[str, Any] = {}
     for varied in plan.vary:
         parameter = _parameter(varied, file)
         ends = parameter.values or (parameter.value(0.0), parameter.value(1.0))
         for value in ends:
             try:
-                _check_value(parameter, value, file, tables)
+                _check_value(parameter, value, file, tables, fixed)
             except InputError as error:
                 raise InputError(f'[[vary]] key = "{shortened(varied.key)}": {error}') from error
+        if len(parameter.values) == 1:
+            fixed[parameter.key] = parameter.values[0]
         parameter_list.append(parameter)
     return parameter_list
 
@@ -564,9 +576,15 @@ def _parameter(varied: Varied, file: BenchFile) -> Parameter:
     )
 
 
-def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict[str, Any]) -> None:
+def _check_value(
+    parameter: Parameter,
+    value: Any,
+    file: BenchFile,
+    tables: dict[str, Any],
+    fixed: dict[str, Any],
+) -> None:
     if parameter.key not in OWN_KEYS:
-        changed_bench(file, tables, {parameter.key: value})
+        changed_bench(file, tables, fixed | {parameter.key: value})
         return
     if parameter.key == SCENARIO:
         if not isinstance(value, str):

@@ -35,13 +35,14 @@ FALSE_DN = 1000.0  # signal of a planted false star
 @dataclass(frozen=True, slots=True)
 class CaseConditions:
     """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, the angular
-    acceleration, rad/s2, cam, the detector's false stars, and the end of the last fault, s (None:
-    none).
+    acceleration, rad/s2, cam, the detector's false stars, the angle from a body, and the end of the
+    last fault, s (None: none).
     """
 
     velocity_km_s: FloatArray
     acceleration_rad_s2: FloatArray
     false_stars: int = 0
+    body_deg: float = 180.0
     fault_end_s: float | None = None
 
 
@@ -93,20 +94,20 @@ class CaseTracker:
     def _silence(self, exposure: Exposure, middle_s: float) -> str:
         """Why the tracker reports no attitude by a planted fault; "" where it reports one."""
         planted = self._planted
-        if self._rng.random() < planted.missing:
-            return "planted: missing"
-        if middle_s < planted.acquisition_s:
-            return "planted: acquisition_s"
-        end_s = self._conditions.fault_end_s
-        if planted.recovery_s and end_s is not None and 0 <= middle_s - end_s < planted.recovery_s:
-            return "planted: recovery_s"
+        conditions = self._conditions
+        end_s = conditions.fault_end_s
+        since_s = math.inf if end_s is None else middle_s - end_s
         rate_deg_s = math.degrees(float(np.linalg.norm(exposure.view.turn.rate_cam_rad_s)))
-        if planted.max_rate_deg_s is not None and rate_deg_s > planted.max_rate_deg_s:
-            return "planted: max_rate_deg_s"
-        limit = planted.max_false_stars
-        if limit is not None and self._conditions.false_stars > limit:
-            return "planted: max_false_stars"
-        return ""
+        fastest, most = planted.max_rate_deg_s, planted.max_false_stars
+        silent = {
+            "missing": self._rng.random() < planted.missing,
+            "acquisition_s": middle_s < planted.acquisition_s,
+            "recovery_s": 0 <= since_s < planted.recovery_s,
+            "max_rate_deg_s": fastest is not None and rate_deg_s > fastest,
+            "max_false_stars": most is not None and conditions.false_stars > most,
+            "exclusion_deg": conditions.body_deg < planted.exclusion_deg,
+        }
+        return next((f"planted: {name}" for name, is_silent in silent.items() if is_silent), "")
 
     def _turned(self, q: FloatArray) -> FloatArray:
         planted = self._planted

@@ -128,9 +128,9 @@ class Campaign:
             del plan[key]
         del plan["require"]  # judged afterwards: another limit is no other campaign
         # so that a campaign of before they were keys is still the same
-        for key in ("columns", "planted"):
-            if not plan[key]:
-                del plan[key]
+        for table, key in ((plan, "columns"), (plan, "planted"), (plan["attitudes"], "body")):
+            if not table[key]:
+                del table[key]
         identity = msgspec.to_builtins(self.identity)
         return About(
             plan,

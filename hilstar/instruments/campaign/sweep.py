@@ -1,9 +1,9 @@
 """A sweep with an edge: the value of a key at which a tracker stops answering, by bisection.
 
-Both ends come first, then the middle of the bracket, again and again; at each level so many cases
-are run. Where it still answers at the stop, and that is not shown, levels before it follow. A case
-is a success where at least half of its frames have a right answer. The edge is where the share of
-successes falls below `share`.
+Both ends come first, then the middle of the widest gap, again and again: that in which the edge is,
+and those to the levels that show it. At each level so many cases are run. A case is a success where
+at least half of its frames have a right answer. The edge is where the share of successes falls
+below `share`.
 
 **Interval.** Successes are taken to become rarer along the sweep, and nothing else. The edge is
 beyond each level whose share is shown to be larger than `share`, and before each level whose share
@@ -24,8 +24,10 @@ from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, clo
 from hilstar.instruments.campaign.plan import Number
 from hilstar.instruments.campaign.results import Columns
 
+STILL, NOT_EVEN = "still answers at", "does not even answer at"
 ENDS = 2  # levels before the first middle
-DEFAULT_CONFIDENCE = 0.95  # by which levels are chosen, whatever the clauses' own
+LEVEL_CONFIDENCE = 0.95  # by which levels are chosen, whatever the clauses' own
+SAME_WIDTH = 1e-9  # gaps that differ by less are equally wide
 
 
 class SweepTable(Table, frozen=True):
@@ -62,6 +64,12 @@ class SweepTable(Table, frozen=True):
             middle = (first + second) / 2
         return float(round(middle)) if self.whole else middle
 
+    def width(self, first: float, second: float) -> float:
+        """How far two levels are apart, on the sweep's scale."""
+        if self.scale == "log":
+            return abs(math.log(second / first))
+        return abs(second - first)
+
     def shown(self, count: "LevelCount", confidence: float) -> tuple[bool, bool]:
         """Whether a level's share is shown to be at least, and to be below, the edge's; the error
         is shared among the levels.
@@ -95,35 +103,35 @@ def counted(level: float, cases: Columns) -> LevelCount:
 
 
 def next_level(sweep: SweepTable, counts: list[LevelCount]) -> float | None:
-    """The level to run after these, in the order in which they were run; None at the end."""
+    """The level to run after these, in the order in which they were run; None at the end.
+
+    Three gaps are halved, the widest first: from the farthest level that passed to the first one
+    that did not, and from each of these to the one that shows it.
+    """
     if len(counts) < ENDS:
         return (sweep.start, sweep.stop)[len(counts)]
     if not counts[0].passed or len(counts) >= sweep.levels:
         return None
-    if counts[1].passed:
-        good, bad = _unshown(sweep, counts)
-    else:
-        good, bad = sweep.start, sweep.stop
-        for count in counts[ENDS:]:
-            if count.passed:
-                good = count.level
-            else:
-                bad = count.level
-    level = sweep.between(good, bad)
-    return None if level in (good, bad) else level
-
-
-def _unshown(sweep: SweepTable, counts: list[LevelCount]) -> tuple[float, float]:
-    """Where it still answers at the stop: the farthest level that is shown to answer, and the next
-    one, so that the edge's lower limit comes up; the stop twice where that is shown.
-    """
-    ordered = sorted(counts, key=lambda count: abs(count.level - sweep.start))
-    shown = [count.level for count in ordered if sweep.shown(count, DEFAULT_CONFIDENCE)[0]]
-    if not shown:
-        return sweep.start, sweep.start
-    levels = [count.level for count in ordered]
-    following = levels.index(shown[-1]) + 1
-    return shown[-1], levels[min(following, len(levels) - 1)]
+    along = sorted({count.level for count in counts}, key=lambda level: abs(level - sweep.start))
+    place = {level: k for k, level in enumerate(along)}
+    passed = max(place[count.level] for count in counts if count.passed)
+    failed = min((place[c.level] for c in counts if not c.passed), default=passed)
+    shown = [(place[c.level], sweep.shown(c, LEVEL_CONFIDENCE)) for c in counts]
+    beyond = max((at for at, (is_good, _) in shown if is_good), default=0)
+    before = min((at for at, (_, is_bad) in shown if is_bad), default=len(along) - 1)
+    first, last = min(passed, failed), max(passed, failed)
+    widest = 0.0
+    best = None
+    for low, high in ((first, last), (beyond, first), (last, before)):
+        if low >= high:
+            continue
+        # a level within the gap that was run already leaves the wider part of it
+        for k in range(low, high):
+            level = sweep.between(along[k], along[k + 1])
+            width = sweep.width(along[k], along[k + 1])
+            if level not in place and width > widest * (1 + SAME_WIDTH):
+                widest, best = width, level
+    return best
 
 
 def edge_figure(sweep: SweepTable, counts: list[LevelCount], confidence: float) -> BoundedFigure:
@@ -150,10 +158,10 @@ def edge_figure(sweep: SweepTable, counts: list[LevelCount], confidence: float) 
     method = f"bisection over {len(counts)} levels, Clopper-Pearson at each"
     if not math.isfinite(good):
         value = sweep.start
-        method += "; it does not even answer at the start"
+        method += f"; {NOT_EVEN} the start"
     elif not math.isfinite(bad):
         value = sweep.stop
-        method += "; it still answers at the stop"
+        method += f"; {STILL} the stop"
     else:
         value = sweep.between(sense * good, sense * bad)
     return BoundedFigure(value, ends[0], ends[1], cases, method)

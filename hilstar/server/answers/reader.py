@@ -13,25 +13,20 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from hilstar.attitude.wire.apart import ReaderProcess
-from hilstar.attitude.wire.byte_links import (
-    ByteLink,
-    FileBytes,
-    SerialBytes,
-    TcpBytes,
-    UdpBytes,
-    ZmqBytes,
-    refuse_no_file,
-)
+from hilstar.attitude.wire.endpoint import UdpPlace
+from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
 from hilstar.attitude.wire.keys import CurveKeys
-from hilstar.attitude.wire.links import RawMessage
+from hilstar.attitude.wire.roads import ANSWERS, ByteRoad, LinkCounts, RawMessage
+from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.source import Components
-from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.attitude.wire.tcp import TcpRoad
+from hilstar.attitude.wire.udp import UdpRoad
+from hilstar.attitude.wire.zmq_links import ZmqRoad
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.closing import Closing
@@ -54,6 +49,7 @@ FLOOD = "flood"
 FLOOD_REST_S = 0.01
 CHUNK_BYTES, LOOK_MS = 65_536, 100
 MAX_DETAILS = 20  # reasons whose newest example is kept
+HELD_S = 3.0  # for so long after its last byte a tracker's connection holds the line
 
 
 class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -83,34 +79,44 @@ class ReadPlan:
     folder: Path
     q_body_to_cam: Components | None
 
-    def open(self, notices: Notices) -> ByteLink:
+    def open(self, notices: Notices, clock: HostClock = HOST_CLOCK) -> ByteRoad:
         """The road. Raises InputError where it cannot be opened."""
         settings = self.settings
         if settings.source == "serial":
-            return SerialBytes(str(settings.port), settings.baud, notices)
+            return SerialRoad(str(settings.port), settings.baud, ANSWERS, notices, clock)
         if settings.source == "file":
-            return FileBytes(self.folder / str(settings.path), notices)
+            return FileRoad(self.folder / str(settings.path), ANSWERS, notices, clock)
         if settings.source == "zmq":
-            names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
-            keys = CurveKeys(*(None if name is None else self.folder / name for name in names))
-            endpoint = settings.endpoint or ZMQ_ENDPOINT
-            bind = settings.bind is True
-            try:
-                return ZmqBytes(
-                    ZmqReceiver(endpoint, bind=bind, keys=keys, notices=notices), notices
-                )
-            except InputError as error:
-                raise InputError(f"[answers] endpoint: {error}") from error
+            return self._open_zmq(notices, clock)
+        place: UdpPlace | tuple[str, int]
         if settings.connect is not None:
-            place: Any = host_and_port(settings.connect)
+            place = host_and_port(settings.connect)
             _, allowed = answers_place(
                 msgspec.structs.replace(settings, listen=None, bind=None, port="", endpoint=None)
             )
         else:
             place, allowed = answers_place(settings)
-        return (TcpBytes if settings.source == "tcp" else UdpBytes)(place, allowed, notices)
+        if settings.source == "udp":
+            return UdpRoad(place, allowed, ANSWERS, notices, clock)
+        listening = isinstance(place, UdpPlace)
+        if isinstance(place, UdpPlace):
+            place = (str(place.host), place.port)
+        return TcpRoad(place, allowed, ANSWERS, notices, clock, listening=listening, held_s=HELD_S)
 
-    def open_first(self, notices: Notices) -> ByteLink:
+    def _open_zmq(self, notices: Notices, clock: HostClock) -> ByteRoad:
+        settings = self.settings
+        names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
+        keys = CurveKeys(*(None if name is None else self.folder / name for name in names))
+        endpoint = settings.endpoint or ZMQ_ENDPOINT
+        bind = settings.bind is True
+        try:
+            return ZmqRoad(
+                endpoint, bind=bind, keys=keys, notices=notices, clock=clock, use=ANSWERS
+            )
+        except InputError as error:
+            raise InputError(f"[answers] endpoint: {error}") from error
+
+    def open_first(self, notices: Notices) -> ByteRoad:
         """The road, at a run's start: where a file is to come, nothing else may be there. Raises
         InputError as `open`.
         """
@@ -129,10 +135,9 @@ class DecodingLink:
     """
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self._link = plan.open(notices)
+        self._road = plan.open(notices, clock)
         self._clock = clock
-        self.link_counts = self._link.link_counts
-        self._decoder = plan.decoder(self._link.messages)
+        self._decoder = plan.decoder(self._road.messages)
         settings = plan.settings
         self._question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
         self._period_s = 1 / settings.poll_hz
@@ -143,6 +148,11 @@ class DecodingLink:
         self._seen_ns = clock.now_ns()
         self._trouble: str | None = None
 
+    @property
+    def link_counts(self) -> LinkCounts:
+        """What the road counts."""
+        return self._road.link_counts
+
     def wait_for_message(self, timeout_ms: int) -> bool:
         """Never known before it is read."""
         return False
@@ -150,11 +160,11 @@ class DecodingLink:
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         """What came and what it says; waits at most `timeout_ms`."""
         if self._question is not None and self._next_question.over:
-            self._link.put(self._question)
+            self._road.put(self._question)
             self._next_question = self._clock.within(self._period_s)
         if self._question is not None:
             timeout_ms = min(timeout_ms, max(int(self._next_question.left_s * 1000), 1))
-        chunks = self._link.taken(timeout_ms)
+        chunks = self._road.taken(timeout_ms)
         now_ns = self._clock.now_ns()
         self._refill(now_ns)
         refused: Counter[str] = Counter()
@@ -198,7 +208,7 @@ class DecodingLink:
         self._work_left_s = min(self._work_left_s + passed_s * WORK_SHARE, MAX_WORK_S)
 
     def _new_trouble(self, now_ns: int) -> list[RawMessage]:
-        trouble = self._link.trouble()
+        trouble = self._road.trouble
         if trouble == self._trouble:
             return []
         self._trouble = trouble
@@ -207,7 +217,7 @@ class DecodingLink:
     def _pieces(self, chunks: list[RawMessage]) -> Iterator[tuple[RawMessage, bytes]]:
         for chunk in chunks:
             data = chunk.parts[-1]
-            if self._link.messages:
+            if self._road.messages:
                 size = max(len(data), 1)
             else:
                 size = PIECE_BYTES
@@ -216,7 +226,7 @@ class DecodingLink:
 
     def close(self) -> None:
         """Close the road."""
-        self._link.close()
+        self._road.close()
 
 
 class AnswersApart(Closing):
@@ -294,7 +304,7 @@ def recorded_answers(
 
 def live_answers(
     plan: ReadPlan,
-    link: ByteLink,
+    link: ByteRoad,
     decoder: AnswerDecoder,
     seconds: float,
     stopped: Callable[[], bool],

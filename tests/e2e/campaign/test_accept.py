@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.e2e.campaign.test_bench import answering
+from tests.e2e.campaign.test_bench import write_bench as write_bench_of_stub
 from tests.support.acceptance import write_bench
 from tests.support.commands import assert_refused, run_hilstar_here
 
@@ -110,3 +113,94 @@ def test_a_plan_that_is_not_there_and_an_option_of_another_way_are_refused(folde
     assert_refused(refused, 2, "--headless", "--through bench")
     bench = run_hilstar_here(*words, "plan.toml", "--through", "bench", cwd=folder)
     assert_refused(bench, 2, "needs the tracker's answers")
+
+
+SLEWS = """
+through = "bench"
+[cases.slews]
+cases = 60
+quick_cases = 30
+frames = 5
+timeout_s = 2.0
+[cases.slews.attitudes]
+kind = "field"
+radec_deg = [80.0, 20.0]
+radius_deg = 1.5
+roll_deg = [0.0, 0.0]
+[[cases.slews.vary]]
+key = "rate_deg_s.x"
+minimum = -0.5
+maximum = 0.5
+[[cases.slews.vary]]
+key = "rate_deg_s.y"
+minimum = -0.5
+maximum = 0.5
+[cases.hot]
+cases = 4
+[[cases.hot.vary]]
+key = "tracker.detector.hot_pixel_fraction"
+values = [0.0, 0.1]
+[[clause]]
+capability = "Time"
+of = "slews"
+quantity = "time-bias"
+maximum = 0.005
+[[clause]]
+capability = "Rate"
+of = "slews"
+quantity = "rate-bias"
+axis = "y"
+maximum = 0.01
+[[clause]]
+capability = "Rate about x"
+of = "slews"
+quantity = "rate-bias"
+axis = "x"
+maximum = 0.01
+[[clause]]
+capability = "Scale"
+of = "slews"
+quantity = "rate-scale"
+axis = "x"
+maximum = 0.05
+[[clause]]
+capability = "Hot pixels"
+of = "hot"
+quantity = "availability"
+minimum = 0.9
+"""
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("clock", ["host", "own"])
+def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, clock: str) -> None:
+    """A stub in a process of its own: stamps late by 0.1 s, rates off by 0.03 deg/s about y. Its
+    answers come after that: a stamp of what is not lit yet is of no frame.
+    """
+    stub = write_bench_of_stub(tmp_path)
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench.read_text().replace('clock = "host"', f'clock = "{clock}"'))
+    (tmp_path / "plan.toml").write_text(SLEWS)
+    now = str(tmp_path / "out" / "slews" / "now.json")
+    planted = replace(
+        stub, now=now, wild=0.0, stamp_bias_s=0.1, latency_s=0.15, rate_bias_deg_s=(0.0, 0.03, 0.0)
+    )
+    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json")
+    with answering(planted):
+        done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = {clause["capability"]: clause for clause in json.loads(done.stdout)["clauses"]}
+    rate = told["Rate"]
+    # found within 10 %, or three standard errors by the one-sided limits
+    assert abs(rate["value"] - 0.03) <= max(0.003, 3 * (rate["high"] - rate["low"]) / 3.29)
+    assert rate["verdict"] == "not met"
+    assert told["Rate about x"]["verdict"] == told["Scale"]["verdict"] == "met"
+    assert told["Hot pixels"]["verdict"] == "not tested"
+    assert "cannot be changed on a real bench" in told["Hot pixels"]["why"]
+    time = told["Time"]
+    if clock == "own":
+        assert time["verdict"] == "not tested" and "own clock" in time["why"]
+    else:
+        # half a frame of 100 Hz, 5 ms, is the display's own
+        assert abs(time["value"] - 0.1) <= 0.01
+        assert time["verdict"] == "not met"

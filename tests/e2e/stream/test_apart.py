@@ -24,12 +24,14 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.wire.apart import ReaderProcess, Record, RecordStream, pack
 from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
-from hilstar.attitude.wire.links import Arrival, LinkCounts, RawMessage
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link
-from hilstar.attitude.wire.packet import AttitudeSample, TimeRequest, decode
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.roads import ANSWERS, ByteRoad, LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialApart
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.udp import Datagrams, UdpLink
+from hilstar.attitude.wire.tcp import TcpRoad
+from hilstar.attitude.wire.udp import UdpLink, UdpRoad
 from hilstar.attitude.wire.vizard import DifferenceRates, Follower, vizard_broadcast
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 from hilstar.basics.notices import Notices
@@ -39,7 +41,6 @@ from tests.support.forks import Started
 from tests.support.senders import connected, free_port, packet, publisher
 from tests.support.sources.nasa42 import message
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
-from tests.support.wire.ptys import Cable
 
 HOLD_S = 0.5
 # A stamp that waits for the lock is late by the rest of the hold; a process that is merely woken
@@ -156,8 +157,8 @@ def test_a_thread_of_that_process_would_stamp_it_after():
 
 
 def child_of(link) -> int:
-    assert link._reader._process is not None
-    return link._reader._process.pid
+    assert link._road._reader._process is not None
+    return link._road._reader._process.pid
 
 
 def test_a_reader_that_hangs_is_begun_again_at_once(caplog):
@@ -166,9 +167,11 @@ def test_a_reader_that_hangs_is_begun_again_at_once(caplog):
     """
     with serial_road() as (link, put):
         await_packet(link, put, 0)
-        before = link._reader.generation  # a busy machine may have begun it again already
+        before = link._road._reader.generation  # a busy machine may have begun it again already
         os.kill(child_of(link), signal.SIGSTOP)
-        wait_for(lambda: not link.receive(100) and link._reader.generation > before, poll_s=0.0)
+        wait_for(
+            lambda: not link.receive(100) and link._road._reader.generation > before, poll_s=0.0
+        )
         await_packet(link, put, 2)
     assert "the attitude receiver stopped (no sign of life for 0.4 s); restarting it" in caplog.text
 
@@ -179,7 +182,7 @@ def test_a_reader_that_dies_is_begun_again_and_the_link_goes_on(road, caplog):
         await_packet(link, put, 0)
         first = child_of(link)
         os.kill(first, signal.SIGKILL)
-        wait_for(lambda: not link.receive(20) and link._reader.generation == 2)
+        wait_for(lambda: not link.receive(20) and link._road._reader.generation == 2)
         await_packet(link, put, 1)
         second = child_of(link)
     assert link._notices.counts()["receiver-failed"] == 1
@@ -220,7 +223,7 @@ import sys, time
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 link = ZmqApart(ZmqReceiver("tcp://127.0.0.1:*", bind=True))
 link.receive(1)
-print(link._reader._process.pid, flush=True)
+print(link._road._reader._process.pid, flush=True)
 time.sleep(60)
 """
     with Started([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
@@ -236,33 +239,6 @@ def _lives(number: int) -> bool:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def test_a_serial_line_that_was_unplugged_is_read_again_and_answers_go_out(tmp_path):
-    with Cable(tmp_path) as cable, SerialApart(str(cable.host), 921_600) as link:
-        sender = os.open(cable.sender, os.O_RDWR | os.O_NOCTTY)
-        wait_for(
-            lambda: os.write(sender, cobs.encode(packet(0, 0)) + b"\0") and link.receive(20),
-            poll_s=0.02,
-        )
-        link.send(TimeRequest(7, 8))
-        answer = b""
-        while not answer.endswith(b"\0"):
-            answer += os.read(sender, 100)
-        assert decode(cobs.decode(answer[:-1])) == TimeRequest(7, 8)
-        os.close(sender)
-        cable.pull()
-        wait_for(lambda: not link.receive(20) and link.link_counts.lost == 1)
-        cable.plug()
-        wait_for(lambda: not link.receive(20) and link.reconnects == 1)
-        sender = os.open(cable.sender, os.O_RDWR | os.O_NOCTTY)
-        wait_for(
-            lambda: os.write(sender, cobs.encode(packet(1, 0)) + b"\0") and link.receive(20),
-            poll_s=0.02,
-        )
-        os.close(sender)
-        assert link.link_counts.lost == 1
-        assert "receiver-failed" not in link._notices.counts()
 
 
 def test_basilisks_topic_and_long_messages_pass_through():
@@ -284,36 +260,48 @@ def test_basilisks_topic_and_long_messages_pass_through():
     assert last.raw == long
 
 
-def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        datagrams = Datagrams.bound(bound_place("127.0.0.1:0", "", None))
-        sender.connect(("127.0.0.1", datagrams.port))
+@contextmanager
+def udp_bytes() -> Iterator[tuple[ByteRoad, socket.socket]]:
+    with (
+        UdpRoad(bound_place("127.0.0.1:0", "", None), AllowedSenders(), ANSWERS) as road,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        sender.connect(("127.0.0.1", int(road.endpoint.rpartition(":")[2])))
+        yield road, sender
 
-        def held(count: int) -> list[tuple[int, int]]:
-            """How long after each began to be sent, and after it was sent, so many datagrams
-            that were read late arrived.
+
+@contextmanager
+def tcp_bytes() -> Iterator[tuple[ByteRoad, socket.socket]]:
+    place = ("127.0.0.1", 0)
+    with TcpRoad(place, AllowedSenders(), ANSWERS, listening=True) as road:
+        port = int(road.endpoint.rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port)) as sender:
+            wait_for(lambda: not road.taken(20) and road.openings == 1, "the connection")
+            yield road, sender
+
+
+@pytest.mark.parametrize("kind", [udp_bytes, tcp_bytes])
+def test_what_was_read_late_has_the_time_of_its_arrival(kind):
+    with kind() as (road, sender):
+
+        def held() -> tuple[int, int]:
+            """How long after it began to be sent, and after it was sent, what is read late
+            arrived.
             """
-            sent_ns = []
-            for _ in range(count):
-                before_ns = time.monotonic_ns()
-                sender.send(b"now")
-                sent_ns.append((before_ns, time.monotonic_ns()))
-                time.sleep(HELD_S)
-            taken = datagrams.take(2 * count)
-            return [
-                (each.host_ns - began, each.host_ns - ended)
-                for each, (began, ended) in zip(taken, sent_ns, strict=True)
-            ]
+            before_ns = time.monotonic_ns()
+            sender.send(b"now")
+            after_ns = time.monotonic_ns()
+            time.sleep(HELD_S)
+            (message,) = road.taken(0)
+            return message.host_ns - before_ns, message.host_ns - after_ns
 
         # The kernel switches its stamps on from a work queue, some time after the socket asks for
         # them.
-        wait_for(lambda: held(1)[0][1] < STAMP_NS, "stamps")
-        late_ns = held(5)
-        datagrams.close()
-    # The stamp is made while the datagram is sent, however long this process is held up there.
-    assert all(
-        after_begin > -STAMP_NS and after_end < STAMP_NS for after_begin, after_end in late_ns
-    ), late_ns
+        wait_for(lambda: held()[1] < STAMP_NS, "stamps")
+        late_ns = [held() for _ in range(5)]
+    # The stamp is made while it is sent, however long this process is held up there.
+    for after_begin_ns, after_end_ns in late_ns:
+        assert after_begin_ns > -STAMP_NS and after_end_ns < STAMP_NS, late_ns
 
 
 def test_records_come_out_whole_however_they_were_cut():

@@ -22,10 +22,9 @@ from tests.support.senders import (
     free_port,
     packet,
     publisher,
-    publishing,
 )
 from tests.support.servers import serving, summary_of
-from tests.support.waiting import CoreWaits, missed_in, wait_for
+from tests.support.waiting import CoreWaits, missed_in
 
 SUMMARY_KEYS = {
     "frames",
@@ -153,36 +152,6 @@ def test_an_oversized_message_costs_a_connection_and_no_more(tmp_path):
         packets = summary_of(process)["packets"]
     assert packets["accepted"] == 120
     assert packets["refused"] == 0
-
-
-def test_a_sender_that_closes_and_comes_back_is_heard_again(tmp_path):
-    context = zmq.Context()
-    with publisher() as (sender, port), serving(tmp_path, port) as process:
-        sender.send(packet(0, 1_000_000))
-        process.has_received(1)
-        sender.unbind(f"tcp://127.0.0.1:{port}")
-        sender.close(linger=0)
-        time.sleep(0.3)  # it is away for a while
-        again = publishing(context)
-        wait_for(
-            lambda: binds(again, port), "the port, which libzmq gives back from a thread of its own"
-        )
-        await_subscriber(again)
-        again.send(packet(1, 2_000_000))
-        process.has_received(2)
-        process.send_signal(signal.SIGINT)
-        packets = summary_of(process)["packets"]
-        again.close(linger=0)
-    context.term()
-    assert packets["accepted"] == 2
-
-
-def binds(sender: zmq.Socket, port: int) -> bool:
-    try:
-        sender.bind(f"tcp://127.0.0.1:{port}")
-    except zmq.ZMQError:
-        return False
-    return True
 
 
 def test_a_silent_sender_shows_blank_frames_and_ends_in_order(tmp_path):

@@ -15,6 +15,16 @@ GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + byt
 def greeted(port: int, kind: bytes = b"PUB") -> socket.socket:
     """A connection that has said hello as a socket of that kind."""
     connection = socket.create_connection(("127.0.0.1", port))
+    try:
+        _greet(connection, kind)
+    except OSError:
+        connection.close()
+        raise
+    connection.settimeout(PATIENCE_S)
+    return connection
+
+
+def _greet(connection: socket.socket, kind: bytes) -> None:
     ready = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
     connection.sendall(GREETING + b"\x04" + bytes([len(ready)]) + ready)
     # a message before the other's READY is against the protocol
@@ -23,8 +33,6 @@ def greeted(port: int, kind: bytes = b"PUB") -> socket.socket:
         said = b""
         while len(said) < 66 or len(said) < 66 + said[65]:
             said += connection.recv(1024) or b"closed" * 100
-    connection.settimeout(PATIENCE_S)
-    return connection
 
 
 def part(body: bytes, *, more: bool) -> bytes:

@@ -1,4 +1,6 @@
-"""Log files: every form, every way from one to another, and every way that one can be wrong."""
+"""Log files: every way from one form to another, what CSV and JSON lines may hold, and how logs are
+written.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,11 @@ from hilstar.basics.errors import InputError
 HEAD = "t_s,qw,qx,qy,qz\n"
 FULL_HEAD = "t_s,qw,qx,qy,qz,rx,ry,rz,sequence,discontinuity\n"
 
-FORMS = ("csv", "jsonl", "json", "aem", "kvn", "xml", "mcap")
 FORMATS = ("csv", "jsonl", "kvn", "xml", "mcap")  # what the endings come down to
 AEM_FORMS = {"aem", "kvn", "xml"}
 # An AEM holds a rate as a quaternion derivative: there and back are 16 products summed by fours,
 # each rounded to eps/2.
 RATE_TOLERANCE = 16 * np.finfo(np.float64).eps
-
-INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
 
 def random_samples(rng, count, every_rate=True):
@@ -107,25 +106,6 @@ def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(
     assert_same(read_log(tmp_path / f"b.{second}"), expected, 2 * RATE_TOLERANCE if aem else 0.0)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_the_ends_of_64_bit_time_and_the_nanoseconds_between_survive(tmp_path, form):
-    times = [
-        INT64_MIN,
-        -1_000_000_001,
-        -1_000_000_000,
-        -1,
-        0,
-        1,
-        1_700_000_000_123_456_789,
-        INT64_MAX,
-    ]
-    write_log(
-        tmp_path / f"a.{form}",
-        [AttitudeSample(t_ns, np.array([0.5, 0.5, 0.5, 0.5])) for t_ns in times],
-    )
-    assert [s.t_ns for s in read_log(tmp_path / f"a.{form}")] == times
-
-
 @pytest.mark.parametrize(("one", "other"), [("jsonl", "json"), ("kvn", "aem")])
 def test_two_endings_of_one_format_hold_the_same(tmp_path, one, other):
     samples = random_samples(np.random.default_rng(7), 30, every_rate=False)
@@ -135,25 +115,6 @@ def test_two_endings_of_one_format_hold_the_same(tmp_path, one, other):
         re.sub("CREATION_DATE.*", "", (tmp_path / f"a.{form}").read_text()) for form in (one, other)
     ]
     assert texts[0] == texts[1]
-
-
-def test_what_a_log_holds_and_not_its_name_says_how_it_is_read(tmp_path):
-    samples = random_samples(np.random.default_rng(3), 5)
-    for form in FORMS:
-        write_log(tmp_path / f"a.{form}", samples)
-        (tmp_path / "log.dat").write_bytes((tmp_path / f"a.{form}").read_bytes())
-        assert [s.t_ns for s in read_log(tmp_path / "log.dat")] == [s.t_ns for s in samples]
-
-
-@pytest.mark.parametrize("form", ["csv", "jsonl", "aem", "xml"])
-def test_a_text_log_may_begin_with_a_byte_order_mark_and_end_its_lines_as_windows_does(
-    tmp_path, form
-):
-    samples = random_samples(np.random.default_rng(3), 5)
-    write_log(tmp_path / f"a.{form}", samples)
-    text = (tmp_path / f"a.{form}").read_bytes().replace(b"\n", b"\r\n")
-    (tmp_path / "log").write_bytes(b"\xef\xbb\xbf" + text)
-    assert [s.t_ns for s in read_log(tmp_path / "log")] == [s.t_ns for s in samples]
 
 
 # CSV and JSON lines
@@ -249,63 +210,14 @@ def test_a_log_that_is_wrong_is_refused_with_its_line(tmp_path, text, line, word
     assert len(message) < len(str(path)) + 300
 
 
-def test_a_log_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
-        read_log(tmp_path / "none.csv")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_log(tmp_path)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_a_damaged_log_is_read_or_refused_in_one_line_and_never_ends_in_a_traceback(tmp_path, form):
-    rng = np.random.default_rng(11)
-    write_log(tmp_path / f"whole.{form}", random_samples(rng, 12, every_rate=False))
-    whole = np.frombuffer((tmp_path / f"whole.{form}").read_bytes(), dtype=np.uint8)
-    path = tmp_path / "log"
-    for trial in range(150):
-        data = whole.copy()
-        if trial % 3:
-            places = rng.integers(0, len(data), size=rng.integers(1, 4))
-            data[places] = (
-                rng.integers(0, 256, size=len(places)) if trial % 3 == 1 else data[places] ^ 1
-            )
-        else:
-            data = data[: rng.integers(0, len(data))]
-        path.write_bytes(data.tobytes())
-        try:
-            times = [sample.t_ns for sample in read_log(path)]
-            assert times == sorted(times)
-        except InputError as error:
-            assert "\n" not in str(error)
-
-
-@pytest.mark.parametrize(
-    "head", [b"", b"\x89MCAP0\r\n", b"<aem", b"CCSDS_AEM_VERS = 2.0\n", b"{", b"t_s,qw,qx,qy,qz\n"]
-)
-def test_binary_rubbish_is_refused_in_one_line(tmp_path, head):
-    for seed in range(20):
-        rubbish = np.random.default_rng(seed).integers(
-            0, 256 if seed % 2 else 128, size=300, dtype=np.uint8
-        )
-        (tmp_path / "log").write_bytes(head + rubbish.tobytes())
-        refusal(tmp_path / "log")
-
-
 # Writing
 
 
 def test_a_name_that_says_no_form_is_refused_with_those_that_do(tmp_path):
     with pytest.raises(InputError, match="not a log's name; end it in one of ") as caught:
         write_log(tmp_path / "a.txt", random_samples(np.random.default_rng(0), 1))
-    for ending in FORMS:
+    for ending in ("csv", "jsonl", "json", "aem", "kvn", "xml", "mcap"):
         assert f".{ending}" in str(caught.value)
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_no_samples_make_no_log(tmp_path, form):
-    with pytest.raises(InputError, match="no attitude"):
-        write_log(tmp_path / f"a.{form}", [])
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_old_log_is_kept_when_the_new_one_fails_half_way(tmp_path):

@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.entries import OPTIONS, Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.logs.log_formats import check_stated, log_formats
-from hilstar.attitude.logs.mcap_formats import ledger_format
-from hilstar.attitude.logs.mcap_log import attitude_message, register_attitudes
-from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Mounting
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import propagate
-from tests.support.sources import ros_bags
-from tests.support.sources import spice_kernels as ck
+from tests.support.log_files import FILES, QUATERNIONS, TURNS, ledger
 from tests.support.sources.aem_messages import kvn
-from tests.support.sources.attitude_texts import cic_text, stk_text
 
 ROUNDING = 1e-14  # of four products of unit quaternions
-TURNS = Rotation.from_euler("xyz", [[10, 20, 30 + k] for k in range(3)], degrees=True)
-QUATERNIONS = TURNS.as_quat(scalar_first=True)
-SAMPLES = [AttitudeSample(k * 10**9, q) for k, q in enumerate(QUATERNIONS)]
 MOUNTING = (0.5, -0.5, -0.5, -0.5)
 STATEMENTS = {
     "mounting": Mounting(MOUNTING, by_option=True),
@@ -43,107 +33,19 @@ STATEMENTS = {
 }
 
 
-def written(name: str) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
-        write_log(folder / name, SAMPLES)
-        return folder / name
-
-    return write
-
-
-def ledger(folder: Path) -> Path:
-    path = folder / "run.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="hilstar")
-        writer.add_metadata("hilstar", {"run_id": "1", "part": "0"})
-        channel = register_attitudes(writer)
-        for sample in SAMPLES:
-            writer.add_message(
-                channel,
-                log_time=sample.t_ns,
-                data=attitude_message(sample),
-                publish_time=sample.t_ns,
-            )
-        writer.finish()
-    return path
-
-
-def aem(folder: Path) -> Path:
-    (folder / "a.aem").write_text(
-        kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], QUATERNION_TYPE="LAST")
-    )
-    return folder / "a.aem"
-
-
-def oem(folder: Path) -> Path:
-    (folder / "a.oem").write_text("CCSDS_OEM_VERS = 2.0\n")
-    return folder / "a.oem"
-
-
-def bag(folder: Path) -> Path:
-    make = ros_bags.Make("humble")
-    sent = []
-    for k, (w, x, y, z) in enumerate(QUATERNIONS.tolist()):
-        sent.append(
-            (
-                "/pose",
-                ros_bags.IMU,
-                k * 10**9 + 1,
-                make.imu(k * 10**9 + 1, "cam", (w, -x, -y, -z), (0, 0, 0)),
-            )
-        )
-    return ros_bags.write_bag2(folder / "bag", sent, "humble")
-
-
-def cic(folder: Path) -> Path:
-    (folder / "a.cic").write_text(cic_text(["60310 0.0 1 0 0 0", "60310 1.0 1 0 0 0"]))
-    return folder / "a.cic"
-
-
-def stk(folder: Path) -> Path:
-    (folder / "a.a").write_text(stk_text(["0 0 0 0 1", "1 0 0 0 1"]))
-    return folder / "a.a"
-
-
-def c_kernel(folder: Path) -> Path:
-    ck.write_texts(folder)
-    with ck.new_ck(folder / "a.bc") as handle:
-        ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(1)), np.arange(0.0, 5.0, 0.25))
-    return folder / "a.bc"
-
-
-# A file of each format, with what has to be stated of it to be read at all.
-LEVEL = Stated(reference="enu", place=(48.1, 11.6, 500.0), epoch_utc="2024-07-01T11:59:50")
-FILES: dict[str, tuple[Callable[[Path], Path], Stated]] = {
-    "CSV": (written("a.csv"), LEVEL),
-    "JSON lines": (written("a.jsonl"), LEVEL),
-    "an MCAP file": (written("a.mcap"), LEVEL),
-    ledger_format.name: (ledger, Stated()),
-    "a CCSDS AEM": (aem, Stated()),
-    "a CCSDS message": (oem, Stated()),
-    "a ROS bag": (bag, LEVEL),
-    "a CIC AEM": (cic, Stated()),
-    "an STK attitude file": (stk, Stated()),
-    "a SPICE CK": (c_kernel, Stated()),
-}
-
-
 def attitudes(path: Path, stated: Stated) -> np.ndarray:
     return np.array([sample.q_icrs_to_cam for sample in open_log(path, stated).samples])
 
 
-def test_every_format_and_every_statement_is_looked_at_here():
-    refusing = {"a ULog of PX4"}  # whatever is stated
-    assert set(FILES) == {each.name for each in log_formats()} - refusing
+def test_every_statement_is_looked_at_here():
     assert set(STATEMENTS) == set(OPTIONS)
 
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("statement", OPTIONS)
 def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
-    make, needed = FILES[name]
-    path = make(tmp_path)
+    needed = FILES[name].stated
+    path = FILES[name].make(tmp_path)
     stated = replace(needed, **{statement: STATEMENTS[statement]})
     own = next(each for each in log_formats() if each.name == name)
     if statement not in own.uses:
@@ -173,12 +75,12 @@ def test_a_place_or_a_date_of_attitudes_in_the_icrs_is_refused(tmp_path, name, s
     with pytest.raises(
         InputError, match=f"{OPTIONS[statement]} is for attitudes that refer to a level frame"
     ):
-        open_log(FILES[name][0](tmp_path), stated)
+        open_log(FILES[name].make(tmp_path), stated)
 
 
 @pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
-    path = FILES[name][0](tmp_path)
+    path = FILES[name].make(tmp_path)
     found = Rotation.from_quat(
         attitudes(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True
     )
@@ -188,7 +90,7 @@ def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 def test_a_mounting_of_the_bench_file_that_turns_nothing_is_told(tmp_path, name):
-    log = open_log(FILES[name][0](tmp_path), Stated(Mounting(MOUNTING)))
+    log = open_log(FILES[name].make(tmp_path), Stated(Mounting(MOUNTING)))
     assert "[tracker] q_body_to_cam does not turn these attitudes" in dict(log.told)["mounting"]
     assert np.array_equal(log.samples[0].q_icrs_to_cam, QUATERNIONS[0])
 
@@ -213,7 +115,7 @@ def test_what_a_bench_file_says_of_packets_is_not_done_to_a_ledger_again(tmp_pat
     with pytest.raises(
         InputError, match=r"\[attitude\] convention: a CCSDS AEM has a convention of its own"
     ):
-        open_log(aem(tmp_path), by_bench)
+        open_log(FILES["a CCSDS AEM"].make(tmp_path), by_bench)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 0, 1, 2), (1, 2, 3, 0)])

@@ -16,19 +16,19 @@ from hilstar.attitude.wire.links import (
     MAX_BURST,
     MAX_PACKETS_PER_S,
     OVER_NS,
-    PAUSE_S,
     FloodGate,
-    LinkCounts,
-    RawMessage,
 )
 from hilstar.attitude.wire.packet import (
     AttitudeSample,
     StreamDecoder,
     declares_discontinuity,
     decode,
+    decode_frame,
     encode,
+    frame_declares_discontinuity,
     framed,
 )
+from hilstar.attitude.wire.roads import PAUSE_S, LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
@@ -39,6 +39,8 @@ from tests.support.waiting import PATIENCE_S
 from tests.support.wire.samples import sample
 
 FRAME = framed(encode(sample(7)))
+COUNT = 3 * MAX_BURST
+JUMPED, DAMAGED = {500, 1500, 1800}, 1800
 
 
 def plain(_: object) -> bool:
@@ -65,64 +67,26 @@ def test_a_burst_passes_and_a_flood_does_not():
     assert gate.newest(burst, plain) == burst
 
 
-def flooded_messages(jumped: set[int]) -> list[AttitudeSample]:
-    return [replace(sample(7), sequence=k, discontinuity=k in jumped) for k in range(3 * MAX_BURST)]
-
-
-class Line(SerialLink):
-    """A line on which every frame was read by itself, all of them before anybody looked."""
-
-    def __init__(self, samples: list[AttitudeSample], damaged: set[int] = frozenset()) -> None:
-        self.clock = FakeClock()
-        self._master, self._slave = os.openpty()
-        frames = [framed(encode(each)) for each in samples]
-        for k in damaged:
-            frames[k] = frames[k][:20] + bytes([frames[k][20] % 255 + 1]) + frames[k][21:]
-        self._chunks = [RawMessage(k, [data], k) for k, data in enumerate([b"\0", *frames])]
-        super().__init__(os.ttyname(self._slave), 921_600, clock=self.clock)
-
-    def _read(self, device, timeout_ms: int) -> list[RawMessage]:
-        chunks, self._chunks = self._chunks, []
-        return chunks
-
-    def close(self) -> None:
-        super().close()
-        os.close(self._master)
-        os.close(self._slave)
-
-
-def test_of_a_line_that_brings_more_the_newest_are_taken_in_one_go():
-    """Frame by frame each one that was too many cost a pause of 5 ms, and the oldest were taken:
-    ages of seconds, no end.
-    """
-    with Line(flooded_messages(set())) as line:
-        taken = [arrival.event.sequence for arrival in line.receive(0)]
-        assert taken == list(range(2 * MAX_BURST, 3 * MAX_BURST))
-        assert line.link_counts.flooded == 2 * MAX_BURST
-        assert line.clock.slept_s == [PAUSE_S]
-
-
-def test_a_jump_that_is_passed_over_still_separates_what_is_before_it_from_what_is_after():
-    """Of two that declare one and were passed over the newest whole one is taken, on every road."""
-    jumped = {500, 1500, 1800}
-    samples = flooded_messages(jumped)
-    with Line(samples, damaged={1800}) as line:
-        on_line = [arrival.event for arrival in line.receive(0)]
-    messages = [encode(each) for each in samples]
-    messages[1800] = messages[1800][:20] + b"?" + messages[1800][21:]
-    as_json = [b'{"t_ns":%d,"q":[1,0,0,0],"sequence":%d,"discontinuity":true}' % (k, k) if k in jumped else message
-               for k, message in enumerate(messages)]  # fmt: skip
-    as_json[1800] = b'{"discontinuity":true}'
-    for form in (messages, as_json):
+def test_the_newest_whole_jump_that_is_passed_over_is_taken_in_every_form():
+    """Of two that declare one and were passed over; a third is damaged."""
+    samples = [replace(sample(7), sequence=k, discontinuity=k in JUMPED) for k in range(COUNT)]
+    packets = [encode(each) for each in samples]
+    packets[DAMAGED] = packets[DAMAGED][:20] + b"?" + packets[DAMAGED][21:]
+    json = list(packets)
+    for k in JUMPED:
+        json[k] = b'{"t_ns":%d,"q":[1,0,0,0],"sequence":%d,"discontinuity":true}' % (k, k)
+    json[DAMAGED] = b'{"discontinuity":true}'
+    frames = [framed(packet)[:-1] for packet in packets]
+    for form, declares, read in (
+        (packets, declares_discontinuity, decode),
+        (json, declares_discontinuity, decode),
+        (frames, frame_declares_discontinuity, decode_frame),
+    ):
         waiting = [RawMessage(k, [message]) for k, message in enumerate(form)]
-        taken = FloodGate(LinkCounts(), Notices()).newest(waiting, declares_discontinuity)
-        events = [decode(message.parts[0]) for message in taken]
-        for found in (events, on_line):
-            assert [event.sequence for event in found] == [
-                1500,
-                *range(2 * MAX_BURST, 3 * MAX_BURST),
-            ]
-            assert [event.discontinuity for event in found[:2]] == [True, False]
+        taken = FloodGate(LinkCounts(), Notices()).newest(waiting, declares)
+        events = [read(message.parts[0]) for message in taken]
+        assert [event.sequence for event in events] == [1500, *range(2 * MAX_BURST, COUNT)]
+        assert [event.discontinuity for event in events[:2]] == [True, False]
 
 
 def test_a_frame_of_which_the_end_comes_after_a_flood_is_taken():

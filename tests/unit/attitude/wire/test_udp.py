@@ -9,16 +9,14 @@ import socket
 import pytest
 
 from hilstar.attitude.wire.endpoint import MAX_KNOWN, AllowedSenders, bound_place
-from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
+from hilstar.attitude.wire.kernel_stamps import SO_TIMESTAMPNS, TIMESPEC, KernelStamps
+from hilstar.attitude.wire.packet import Status, TimeReply, TimeRequest, encode
 from hilstar.attitude.wire.udp import (
     MAX_CREDIT_BYTES,
     MAX_PEERS,
     MAX_STRANGERS,
-    SO_TIMESTAMPNS,
-    TIMESPEC,
     Credit,
     Datagrams,
-    KernelStamps,
     UdpLink,
 )
 from hilstar.basics.notices import Notices
@@ -128,22 +126,6 @@ def test_credit_is_bounded_in_bytes_and_in_addresses():
     newest = ("127.0.0.1", 10 * MAX_PEERS - 1)
     assert credit.spend(newest, MAX_CREDIT_BYTES)
     assert not credit.spend(newest, 1)
-
-
-def test_the_link_itself_sends_to_nobody():
-    with (
-        UdpLink(ANYWHERE, AllowedSenders()) as link,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
-        sender.connect(("127.0.0.1", int(link.endpoint.rpartition(":")[2])))
-        sender.setblocking(False)
-        sender.send(packet(1, 5))
-        assert link.wait_for_message(1000)
-        (arrival,) = link.receive(0)
-        assert isinstance(arrival.event, AttitudeSample)
-        link.send(TimeRequest(1, 1))
-        with pytest.raises(BlockingIOError):
-            sender.recv(100)
 
 
 def received(bound: Datagrams, data: bytes, sources: list[str]) -> set[str]:

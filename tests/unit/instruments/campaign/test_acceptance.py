@@ -51,6 +51,12 @@ SETS = {
         "[cases.rate-limit]\ncases = 16\n[cases.rate-limit.sweep]\n"
         'key = "rate_deg_s.across"\nstart = 0.1\nstop = 10.0\nscale = "log"\nrounds = 7\n'
     ),
+    "sun": (
+        '[cases.sun]\ncases = 16\n[cases.sun.attitudes]\nkind = "body"\nbody = "sun"\n'
+        '[cases.sun.sweep]\nkey = "body_deg"\nstart = 90.0\nstop = 0.0\n'
+        '[[cases.sun.vary]]\nkey = "sky.epoch_utc"\nvalues = ["2026-03-20T12:00:00"]\n'
+        '[[cases.sun.vary]]\nkey = "sky.bodies.sun"\nvalues = [true]\n'
+    ),
     "false-stars": (
         "[cases.false-stars]\ncases = 16\n[cases.false-stars.sweep]\n"
         'key = "tracker.detector.false_stars"\nstart = 1\nstop = 200\nscale = "log"\nwhole = true\n'
@@ -82,6 +88,7 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "star-limit": ("stars", "star_limit_v_mag = 5.0", 5.0, "minimum"),
     "false-stars": ("stars", "false_stars = 2.0", 2.0, "maximum"),
     "rate-limit": ("rate-limit", "max_rate_deg_s = 2.0", 2.0, "minimum"),
+    "sun edge": ("sun", "exclusion_deg = 30.0", 30.0, "maximum"),
     "false-stars edge": ("false-stars", "max_false_stars = 40", 40.0, "minimum"),
 }
 # A lag of 0.4 s is on top of the half step, 0.1 s, that a rate of two attitudes has; an attitude

@@ -9,14 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.coordinates import get_sun
 from astropy.io import fits
+from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics.rotation import propagate
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.instruments.campaign.cases import CaseMaker
 from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, parse_plan
 from hilstar.instruments.campaign.session import Session
+from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
@@ -191,3 +195,81 @@ def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> 
     assert (
         Rotation.from_quat(first.q_icrs_to_cam, scalar_first=True) * camera.inv()
     ).magnitude() < 1e-12
+
+
+def bodied(folder: Path, **keys: Any) -> CaseMaker:
+    """The cases of a plan that looks 30 degrees from the Sun."""
+    plan = write_campaign(
+        folder,
+        {"key": "sky.epoch_utc", "values": ["2026-03-20T12:00:00"]},
+        {"key": "sky.bodies.sun", "values": [True]},
+        {"key": "body_deg", "values": [30.0]},
+        attitudes={"kind": "body", "body": "sun"} | keys,
+    )
+    file = read_bench_file(folder / "bench.toml")
+    return CaseMaker(parse_plan(plan, plan.read_text()), file, folder)
+
+
+def test_a_case_beside_a_body_looks_at_its_angle_from_where_astropy_has_it(tmp_path: Path) -> None:
+    maker = bodied(tmp_path)
+    sun = get_sun(Time("2026-03-20T12:00:00")).cartesian.xyz.value
+    sun = sun / np.linalg.norm(sun)
+    points = np.random.default_rng(1).random((20, 6))
+    boresights = np.array(
+        [to_matrix(maker.case(k, point).first.q_icrs_to_cam)[2] for k, point in enumerate(points)]
+    )
+    # the aberration between the two, and ICRS against GCRS: 21 arcsec
+    assert np.degrees(np.arccos(boresights @ sun)) == pytest.approx(30.0, abs=0.01)
+    beside = boresights - (boresights @ sun)[:, None] * sun
+    assert np.linalg.norm(beside.mean(axis=0)) < 0.25  # on every side: 0.5 / sqrt(20), twice over
+
+
+def test_a_body_that_the_bench_has_not_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="bench has none"):
+        bodied(tmp_path, body="moon")
+    with pytest.raises(InputError, match="go together"):
+        bodied(tmp_path, body=None)
+
+
+def test_a_case_that_speeds_up_turns_as_its_rate_says(tmp_path: Path) -> None:
+    plan = write_campaign(
+        tmp_path,
+        {"key": "rate_deg_s.x", "values": [0.5]},
+        {"key": "acceleration_deg_s2.x", "values": [0.2]},
+        {"key": "acceleration_deg_s2.y", "values": [-0.1]},
+    )
+    file = read_bench_file(tmp_path / "bench.toml")
+    maker = CaseMaker(parse_plan(plan, plan.read_text()), file, tmp_path)
+    case = maker.case(0, np.full(6, 0.3))
+    later = maker.after(case, 2_000_000_000)
+    rate = np.radians([0.5 + 0.4, -0.2, 0.0])
+    assert later.turn.rate_cam_rad_s == pytest.approx(rate, abs=1e-12)
+    # by SciPy's rotations in steps of a millisecond
+    turn = Rotation.identity()
+    for k in range(2000):
+        middle_s = (k + 0.5) / 1000
+        step = np.radians([0.5 + 0.2 * middle_s, -0.1 * middle_s, 0.0]) / 1000
+        turn = Rotation.from_rotvec(-step) * turn
+    first = Rotation.from_quat(np.roll(case.first.q_icrs_to_cam, -1))
+    found = Rotation.from_quat(np.roll(later.q_icrs_to_cam, -1))
+    off_arcsec = np.degrees((found * (turn * first).inv()).magnitude()) * 3600
+    # midpoints of 10 ms against those of 1 ms: a step of rate 1 deg/s is off by under 1e-9 deg
+    assert off_arcsec < 1e-3
+
+
+def test_stray_light_is_even_and_in_every_exposure(tmp_path: Path) -> None:
+    vary = {"key": "stray_e_per_px", "values": [0.0, 5000.0]}
+    write_campaign(tmp_path, vary, sampling="grid", cases=2, frames=2)
+    this = session(tmp_path)
+    where = Design("grid", 7, 2, 3, [2]).points(0, 2)
+    for number, wanted_e in ((0, 0.0), (1, 5000.0)):
+        case = this.maker.case(number, where[number])
+        tracker = this._at(this.maker.bench(case))
+        assert isinstance(tracker, Simulator)
+        for frame in range(2):
+            view = this.maker.view(case, frame, tracker.config.tracker.exposure_s)
+            exposure = tracker.expose(view, None, this.maker.faults(case, view, tracker))
+            corners_e = exposure.mean_e[[0, 0, -1, -1], [0, -1, 0, -1]]
+            # a glow of 80 degrees falls by 0.2 % to the corners, 3.4 degrees off
+            assert corners_e == pytest.approx(wanted_e, rel=0.005)
+    this.close()

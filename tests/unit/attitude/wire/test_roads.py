@@ -1,0 +1,348 @@
+"""Who holds a tracker's TCP line, and which files are read: what is refused, let go, told, and
+taken again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Callable, Iterator
+from ipaddress import ip_address
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
+from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
+from hilstar.attitude.wire.roads import ANSWERS, ByteRoad
+from hilstar.attitude.wire.serial_link import SerialRoad
+from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
+from hilstar.attitude.wire.udp import UdpRoad
+from hilstar.attitude.wire.zmq_links import ZmqRoad
+from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.server.answers.reader import HELD_S
+from tests.support.fake_clock import FakeClock
+from tests.support.waiting import wait_for
+from tests.support.wire.far_ends import SerialFar, ZmqFar
+
+SOON_MS = 20
+
+
+@contextlib.contextmanager
+def listening(
+    clock: FakeClock, notices: Notices, allow: tuple[str, ...] = ()
+) -> Iterator[tuple[TcpRoad, int]]:
+    with TcpRoad(
+        ("127.0.0.1", 0),
+        AllowedSenders(allow),
+        ANSWERS,
+        notices,
+        clock,
+        listening=True,
+        held_s=HELD_S,
+    ) as link:
+        yield link, int(link.endpoint.rpartition(":")[2])
+
+
+def connect(port: int) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", port), 5)
+
+
+def taken(link: ByteRoad) -> bytes:
+    """What has come within a look."""
+    return b"".join(chunk.parts[-1] for chunk in link.taken(SOON_MS))
+
+
+def closed(link: TcpRoad, made: socket.socket) -> bool:
+    """Whether the link has closed a connection, which it may do at its next look."""
+    link.taken(SOON_MS)
+    made.settimeout(0.05)
+    try:
+        return made.recv(1) == b""
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def hold(link: TcpRoad, port: int, clock: FakeClock) -> socket.socket:
+    """A connection that is accepted and has sent."""
+    made = connect(port)
+    made.sendall(b"a")
+    wait_for(lambda: taken(link) == b"a", "the first bytes")
+    clock.work(1e9 * ACCEPT_EACH_S)
+    return made
+
+
+def test_a_link_without_a_tracker_rests_after_a_stranger_that_it_refused():
+    """Whoever connects again and again from a place that is not allowed keeps no core busy."""
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices, ("192.0.2.0/24",)) as (link, port), connect(port) as stranger:
+        wait_for(lambda: closed(link, stranger), "the refusal")
+        looks = 0
+        begun_ns = clock.now_ns()
+        while clock.now_ns() - begun_ns < 1e9 and looks < 1000:
+            connect(port).close()
+            link.taken(SOON_MS)
+            looks += 1
+    assert looks <= 2.5 / ACCEPT_EACH_S  # a connection, and the rest after it
+
+
+def test_a_second_connection_is_refused_and_named_while_the_first_sends():
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices) as (link, port), hold(link, port, clock) as first:
+        assert link.trouble == ""
+        for _ in range(5):
+            second = connect(port)
+            own = second.getsockname()[1]
+            second.sendall(b"lies")
+            wait_for(lambda second=second: closed(link, second), "the refusal")
+            second.close()
+            assert (
+                f"from 127.0.0.1:{own}" in link.trouble
+                and f":{first.getsockname()[1]} holds the line" in link.trouble
+            )
+            clock.work(0.9e9 * HELD_S)
+            first.sendall(b"b")
+            wait_for(lambda: taken(link) == b"b", "the first one's bytes")
+        assert notices.counts() == {"second-connection": 5}
+        assert (link.link_counts.refused, link.link_counts.connections) == (5, 1)
+        clock.work(1e9 * TOLD_S)
+        assert link.trouble == ""
+
+
+def test_a_tracker_behind_a_half_open_line_is_back_after_three_seconds_and_not_before():
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices) as (link, port), hold(link, port, clock) as half_open:
+        clock.work(0.9e9 * HELD_S)
+        with connect(port) as early:
+            wait_for(lambda: closed(link, early), "the refusal")
+        clock.work(0.1e9 * HELD_S)
+        with connect(port) as again:
+            again.sendall(b"c")
+            wait_for(lambda: taken(link) == b"c", "the tracker's bytes")
+            assert closed(link, half_open)
+            assert link.trouble == ""
+    assert notices.counts() == {"second-connection": 1, "answers-lost": 1, "answers-back": 1}
+
+
+def test_a_tracker_that_closed_its_line_is_back_at_once():
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices) as (link, port):
+        hold(link, port, clock).close()
+        with connect(port) as again:  # both wait: the end of the first line, and the second
+            again.sendall(b"d")
+            wait_for(lambda: taken(link) == b"d", "the tracker's bytes")
+    assert "second-connection" not in notices.counts()
+
+
+def test_a_line_that_never_sent_holds_for_as_long_and_no_longer():
+    clock = FakeClock()
+    with listening(clock, Notices()) as (link, port), connect(port):
+        wait_for(
+            lambda: link.taken(SOON_MS) == [] and link.link_counts.connections == 1,
+            "the silent one",
+        )
+        clock.work(1e9 * HELD_S)
+        with connect(port) as tracker:
+            tracker.sendall(b"e")
+            wait_for(lambda: taken(link) == b"e", "the tracker's bytes")
+
+
+def test_the_kernel_asks_a_tracker_that_says_nothing_whether_it_is_there():
+    """A cable that was pulled ends the connection in seconds, and not in two hours."""
+    clock = FakeClock()
+    with listening(clock, Notices()) as (link, port), hold(link, port, clock):
+        option = link._connection.getsockopt
+        assert option(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        tcp = [socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT]
+        idle_s, interval_s, count = [option(socket.IPPROTO_TCP, name) for name in tcp]
+        assert idle_s + interval_s * count <= 6
+
+
+def replaced(path: Path, kind: str) -> None:
+    path.unlink(missing_ok=True)
+    if kind == "a device":
+        path.symlink_to("/dev/zero")
+    elif kind == "a FIFO":
+        os.mkfifo(path)
+    elif kind == "a directory":
+        path.mkdir()
+    else:
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(str(path))
+
+
+@pytest.mark.parametrize("kind", ["a device", "a FIFO", "a directory", "a socket"])
+def test_a_file_that_becomes_something_else_is_let_go_told_once_and_taken_again(tmp_path, kind):
+    path, notices, clock = tmp_path / "t.bin", Notices(), FakeClock()
+    path.touch()
+    with FileRoad(path, ANSWERS, notices, clock) as link:
+        path.write_bytes(b"one")
+        assert taken(link) == b"one"
+        replaced(path, kind)
+        for _ in range(3):
+            assert taken(link) == b""
+        assert link.trouble == f"it is {kind} now, and no regular file"
+        assert notices.counts() == {"answers-lost": 1}
+        if kind == "a directory":
+            path.rmdir()
+        else:
+            path.unlink()
+        path.write_bytes(b"two")
+        assert taken(link) == b"two"
+        assert link.trouble == ""
+        assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
+
+
+@pytest.mark.parametrize("kind", ["a device", "a FIFO", "a directory", "a socket"])
+def test_a_path_that_names_no_regular_file_at_the_start_is_refused(tmp_path, kind):
+    replaced(tmp_path / "t.bin", kind)
+    with pytest.raises(InputError, match=f"path = .*t.bin: {kind}; write the file"):
+        refuse_no_file(tmp_path / "t.bin")
+    # A reader that is started again in a run waits for the file instead.
+    with FileRoad(tmp_path / "t.bin", ANSWERS, Notices(), FakeClock()) as link:
+        assert taken(link) == b"" and kind in link.trouble
+
+
+@pytest.mark.parametrize("then", ["gone", "a link to itself", "a link to nothing"])
+def test_a_file_that_cannot_be_read_any_more_is_told_while_that_lasts(tmp_path, then):
+    path, notices = tmp_path / "t.bin", Notices()
+    path.touch()
+    with FileRoad(path, ANSWERS, notices, FakeClock()) as link:
+        assert taken(link) == b"" and link.trouble == ""
+        path.unlink()
+        if then != "gone":
+            path.symlink_to(path if then == "a link to itself" else tmp_path / "nothing")
+        assert taken(link) == b"" and f"{path} cannot be read (" in link.trouble
+        path.unlink(missing_ok=True)
+        path.write_bytes(b"two")
+        assert taken(link) == b"two" and link.trouble == ""
+
+
+def test_a_file_that_comes_back_is_no_trouble_any_more(tmp_path):
+    path, aside = tmp_path / "t.bin", tmp_path / "aside.bin"
+    path.touch()
+    with FileRoad(path, ANSWERS, Notices(), FakeClock()) as link:
+        path.rename(aside)
+        assert taken(link) == b"" and link.trouble
+        aside.rename(path)
+        assert taken(link) == b"" and link.trouble == ""
+
+
+def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path):
+    path, notices = tmp_path / "t.bin", Notices()
+    with FileRoad(path, ANSWERS, notices, FakeClock()) as link:
+        assert taken(link) == b"" and "cannot be read (No such file" in link.trouble
+        path.symlink_to("/dev/zero")
+        assert taken(link) == b"" and "a device" in link.trouble
+
+
+@pytest.mark.parametrize("kind", ["serial", "tcp"])
+def test_a_road_that_is_lost_is_tried_at_growing_intervals_and_told_as_its_user_s(tmp_path, kind):
+    """A read that opens it brings nothing, and none waits for longer than it may."""
+    clock, notices = FakeClock(), Notices()
+    with lost_road(kind, tmp_path, clock, notices) as (road, bring_back):
+        assert road.link_counts.lost == 1 and notices.counts() == {"answers-lost": 1}
+        tries_ns: list[int] = []
+        opens = road._open if isinstance(road, SerialRoad) else road._connect
+
+        def tried() -> None:
+            tries_ns.append(clock.now_ns())
+            opens()
+
+        name = "_open" if isinstance(road, SerialRoad) else "_connect"
+        setattr(road, name, tried)
+        begun_ns = clock.now_ns()
+        while len(tries_ns) < 6:
+            before_ns = clock.now_ns()
+            assert road.taken(SOON_MS) == []
+            assert not road.put(b"?") and not road.wait_for_message(0)
+            assert clock.now_ns() - before_ns <= SOON_MS * 1_000_000
+        waits_s = np.diff([begun_ns, *tries_ns]) / 1e9
+        assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.25, 0.25, 0.25], abs=0.001)
+        bring_back()
+        while road.openings < 2:
+            assert road.taken(SOON_MS) == []
+        assert (road.reconnects, road.link_counts.lost) == (1, 1)
+        assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
+        assert road.put(b"?")
+
+
+@contextlib.contextmanager
+def lost_road(
+    kind: str, folder: Path, clock: FakeClock, notices: Notices
+) -> Iterator[tuple[SerialRoad | TcpRoad, Callable[[], None]]]:
+    """A road to a tracker that has gone, and what brings the tracker back."""
+    with contextlib.ExitStack() as stack:
+        if kind == "serial":
+            far = SerialFar(folder)
+            road = SerialRoad(str(folder / "port"), 115_200, ANSWERS, notices, clock)
+            stack.enter_context(road)
+            far.vanish()
+            wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
+            yield road, far.come
+            far.vanish()
+            return
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            place = ("127.0.0.1", server.getsockname()[1])
+            road = TcpRoad(place, AllowedSenders(), ANSWERS, notices, clock, listening=False)
+            stack.enter_context(road)
+            assert road.taken(SOON_MS) == [] and road.openings == 1
+            server.accept()[0].close()
+            wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
+
+        def come_back() -> None:
+            stack.enter_context(socket.create_server(place))
+
+        yield road, come_back
+
+
+def test_a_tracker_that_is_asked_over_udp_is_the_only_one_that_is_heard():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as tracker:
+        tracker.bind(("127.0.0.1", 0))
+        place = tracker.getsockname()
+        with (
+            UdpRoad(place, AllowedSenders(), ANSWERS) as road,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+        ):
+            assert road.endpoint == f"udp://127.0.0.1:{place[1]}"
+            assert road.put(b"?")
+            asked, asker = tracker.recvfrom(10)
+            assert asked == b"?"
+            stranger.sendto(b"lies", asker)
+            tracker.sendto(b"answer", asker)
+            assert taken(road) == b"answer" and taken(road) == b""
+            assert (road.openings, road.reconnects) == (1, 0)
+
+
+def test_a_bound_udp_road_sends_to_nobody_by_itself():
+    with (
+        UdpRoad(UdpPlace(ip_address("127.0.0.1"), 0), AllowedSenders(), ANSWERS) as road,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as tracker,
+    ):
+        tracker.connect(("127.0.0.1", int(road.endpoint.rpartition(":")[2])))
+        tracker.send(b"answer")
+        assert taken(road) == b"answer"
+        assert not road.put(b"?")
+
+
+def test_a_tracker_over_zeromq_that_vanishes_is_told_as_the_tracker_and_not_as_the_sender(tmp_path):
+    far, notices = ZmqFar(tmp_path), Notices()
+    with ZmqRoad(far.place, notices=notices, use=ANSWERS) as road:
+
+        def heard() -> bool:
+            far.put(b"answer")
+            return taken(road)[:6] == b"answer"
+
+        wait_for(heard, "the road", poll_s=0.005)
+        far.vanish()
+        wait_for(lambda: not taken(road) and road.link_counts.lost == 1, "the loss")
+        far.come()
+        wait_for(heard, "the road again", poll_s=0.005)
+        assert (road.openings, road.reconnects) == (2, 1)
+    far.vanish()
+    assert notices.counts() == {"answers-lost": 1, "answers-back": 1}

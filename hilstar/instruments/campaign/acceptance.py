@@ -29,6 +29,7 @@ from hilstar.instruments.campaign.requirements import (
 from hilstar.instruments.campaign.results import Columns, read_cases
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
+from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.campaign.store import Directory, failures, require_parquet
 from hilstar.instruments.campaign.sweep import LevelCount, counted, edge_figure, next_level
 from hilstar.server.bench.alignment import cube_to_boresight
@@ -263,6 +264,15 @@ class Acceptance:
             return None, 0.0
         late_ms = self.certificate.expanded(("latency",)) or 0.0
         return self.certificate.attitude_arcsec, late_ms / 1e3
+
+    @property
+    def solver_text(self) -> str:
+        """What was tested, in words."""
+        if self.on_bench:
+            return "the real tracker's answers"
+        if self._solver == CENTROIDS:
+            return f"{CENTROIDS}: the virtual tracker, whose stars are named by the truth"
+        return self._solver
 
     @functools.cached_property
     def cube(self) -> CubeToBoresight | None:

@@ -410,6 +410,7 @@ def _about(acceptance: Acceptance, results: list[SetResult], rows: int) -> Card:
         ("plan", str(plan.path)),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
         ("through", plan.through),
+        ("solver", acceptance.solver_text),
         ("program", f"hilstar {__version__}"),
         ("ledger", f"{rows} cases in {LEDGER}, sha256 {ledger_sha256}"),
     ]

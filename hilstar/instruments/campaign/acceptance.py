@@ -52,8 +52,7 @@ class Acceptance(AcceptedBench):
     def __init__(
         self, plan: AcceptancePlan, bench: Path, directory: Path, solver: str, timeout_s: float
     ) -> None:
-        super().__init__(plan, bench, directory)
-        self._solver = solver
+        super().__init__(plan, bench, directory, solver)
         self._timeout_s = timeout_s
         self.sets = plan.sets
         require_parquet()
@@ -62,7 +61,7 @@ class Acceptance(AcceptedBench):
         """The campaign of a set of cases, at a level of its sweep."""
         text = case_set.text(level)
         path = self.plan.path
-        return Campaign(path, folder, self._solver, self._timeout_s, False, text=text)
+        return Campaign(path, folder, self.solver, self._timeout_s, False, text=text)
 
     def check(self) -> None:
         """Refuse (InputError) sets whose campaigns could not run, before the first case. What this

@@ -412,6 +412,7 @@ def _about(acceptance: AcceptedBench, results: list[SetResult], rows: int) -> Ca
         ("plan", str(plan.path)),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
         ("through", plan.through),
+        ("solver", acceptance.solver_text),
         ("program", f"hilstar {__version__}"),
         ("ledger", f"{rows} cases in {LEDGER}, sha256 {ledger_sha256}"),
     ]

@@ -8,6 +8,7 @@ from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
 from hilstar.instruments.campaign.requirements import RequirementVerdict
 from hilstar.instruments.campaign.results import Columns
+from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.campaign.sweep import LevelCount
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
@@ -57,9 +58,10 @@ class CostOfSet:
 class AcceptedBench:
     """A plan, the bench that it is run on, and where its results stand. Raises InputError."""
 
-    def __init__(self, plan: AcceptancePlan, bench: Path, directory: Path) -> None:
+    def __init__(self, plan: AcceptancePlan, bench: Path, directory: Path, solver: str) -> None:
         self.plan = plan
         self.directory = directory
+        self.solver = solver
         self.file: BenchFile = read_bench_file(bench)
         self.on_bench = plan.through == "bench"
         self.certificate: Certificate | None = None
@@ -82,6 +84,15 @@ class AcceptedBench:
             return None, 0.0
         late_ms = self.certificate.expanded(("latency",)) or 0.0
         return self.certificate.attitude_arcsec, late_ms / 1e3
+
+    @property
+    def solver_text(self) -> str:
+        """What was tested, in words."""
+        if self.on_bench:
+            return "the real tracker's answers"
+        if self.solver == CENTROIDS:
+            return f"{CENTROIDS}: the virtual tracker, whose stars are named by the truth"
+        return self.solver
 
     @cached_property
     def cube(self) -> CubeToBoresight | None:

@@ -36,8 +36,14 @@ ROOMS = ("sky", "optics", "display", "attitude", "tracker", "server/loop.py")
 # A mutant that never ends is found, too: an unchanged checkout takes a tenth of it when idle.
 MAX_RUN_S = 1800
 HANGS = "it does not end"
+# a test that takes longer waits for what never comes, and ends the run (pytest 9.0 or newer)
+STUCK_S = 120
 # tests of one mutant that fail for other reasons, before its outcome is "none found"
 MAX_PASSED_OVER = 5
+STUCK_ENDS = (
+    *("-o", f"faulthandler_timeout={STUCK_S}"),
+    *("-o", "faulthandler_exit_on_timeout=true"),
+)
 FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
 NOTHING_TO_RUN = 5  # pytest's exit code
 # the environment variables of tests/support/near_first.py
@@ -200,7 +206,8 @@ class Suite:
     def first_failure(self, module: str, passed_over: Sequence[str] = ()) -> str:
         """The first test that fails but for those `passed_over`, "" where none does.
 
-        HANGS where the tests do not end; pytest's last line where no test is named.
+        One that does not end is one that fails. HANGS where the tests together take too long;
+        pytest's last line where no test is named.
         """
         arguments = ["-x", "-p", "tests.support.near_first"]
         for test in passed_over:
@@ -217,7 +224,7 @@ class Suite:
     def _pytest(self, arguments: list[str], variables: dict[str, str]) -> str:
         try:
             run = subprocess.run(
-                [sys.executable, "-m", "pytest", "-q", "-n0", *arguments],
+                [sys.executable, "-m", "pytest", "-v", "-n0", *STUCK_ENDS, *arguments],
                 cwd=self.checkout,
                 env=os.environ | {"PYTHONPATH": str(self.checkout)} | variables,
                 capture_output=True,
@@ -232,7 +239,8 @@ class Suite:
         failed = FAILED.search(run.stdout)
         if failed is not None:
             return failed[1]
-        return (run.stdout or run.stderr or "no output").strip().splitlines()[-1]
+        # of a run that a stuck test ended, the name of that test
+        return (run.stdout or run.stderr or "no output").strip().splitlines()[-1].strip()
 
 
 @contextmanager

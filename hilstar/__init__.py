@@ -8,6 +8,7 @@ collect.
 218 stars
 """
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 from hilstar.basics.version import __version__ as __version__
@@ -47,7 +48,15 @@ def __getattr__(name: str) -> Any:
     start.
     """
     if name not in __all__:
-        raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
+        from hilstar.basics.errors import did_you_mean
+
+        # private names are asked for by tools, which read no advice
+        meant = "" if name.startswith("_") else did_you_mean(name, __all__).strip()
+        raise AttributeError(
+            f"module 'hilstar' has no attribute {name!r}{meant and '; '}{meant}",
+            name=name,
+            obj=sys.modules[__name__],
+        )
     from importlib import import_module
 
     if name in {"rotation", "testing"}:

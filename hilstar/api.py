@@ -17,7 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray
-from hilstar.basics.attitudes import quaternion_of, rate_of, seconds_of, t_ns_of, whole_of
+from hilstar.basics.attitudes import (
+    path_of,
+    quaternion_of,
+    rate_of,
+    seconds_of,
+    t_ns_of,
+    whole_of,
+)
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.rotation import to_radec_roll_deg
 from hilstar.optics.layers.truth import clipped_in
@@ -63,6 +70,10 @@ COLUMN_UNITS = {
     "_k": "K",
 }
 ROUNDING = 1e-6  # of a unit quaternion that is written with seven digits
+MAX_FIELDS = 100_000
+FAULTS_FORM = (
+    "write a layer of faults, or leave it out; `hilstar frame --scenario FILE.toml` draws a file's"
+)
 PICTURE_PX = 640  # width of a picture in a notebook
 # A bench without a file: what messages call it, in the current folder.
 FROM_TABLES, FROM_CONFIG = Path("dictionary"), Path("configuration")
@@ -179,7 +190,7 @@ class SkyFrame(Frame):
         >>> print(frame.save("golden.fits"))
         golden.fits
         """
-        target, bench = Path(path), self._bench
+        target, bench = path_of(path, "save"), self._bench
         if target.name.endswith((".fits", ".fits.gz")):
             write_frame_fits(target, bench, self)
         elif target.suffix == ".csv":
@@ -212,6 +223,14 @@ class SkyFrame(Frame):
         }
         image = f'<img width="{PICTURE_PX}" alt="the frame, stretched" src="data:image/png;base64,'
         return f'{image}{picture}">{_figures_html(figures)}'
+
+
+def _check_faults(faults: object) -> None:
+    """Raise InputError for what is no layer of faults."""
+    from hilstar.optics.layers.faults import FaultLayer
+
+    if faults is not None and not isinstance(faults, FaultLayer):
+        raise InputError(f"faults {shortened(repr(faults))}: {FAULTS_FORM}")
 
 
 def _unit_quaternion(q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -261,6 +280,8 @@ class OpenBench(Bench):
         >>> frame
         <hilstar frame at RA 84.057, Dec -1.200, roll 0.000 deg: 218 stars, ...>
         """
+        self._refuse_closed("frame")
+        _check_faults(faults)
         drawn = super().frame(
             quaternion_of(q_icrs_to_cam, roll_deg),
             whole_of(number, "number"),
@@ -290,6 +311,7 @@ class OpenBench(Bench):
         ...     print(bench.draw([0.6987226, 0.7135120, -0.0370377, 0.0362700]).levels.shape)
         (1080, 1920)
         """
+        self._refuse_closed("draw")
         if q_icrs_to_cam is None and roll_deg is not None:
             raise InputError("draw: a blank frame has no roll; leave roll_deg out")
         q = None
@@ -325,6 +347,7 @@ class OpenBench(Bench):
         """
         from hilstar.instruments.simulate.simulator import FrameNoise
 
+        self._refuse_closed("simulate")
         if noise not in {"full", "none"}:
             raise InputError(f"noise {shortened(repr(noise))}: write full or none")
         q = checked_quaternion(quaternion_of(q_icrs_to_cam, roll_deg))
@@ -353,7 +376,7 @@ class OpenBench(Bench):
         from hilstar.instruments.verify.summary import verify
 
         generator = np.random.default_rng(whole_of(seed, "seed"))
-        return verify(self.file, whole_of(fields, "fields", 1), generator)
+        return verify(self.file, whole_of(fields, "fields", 1, MAX_FIELDS), generator)
 
     def budget(self, centroider: By | None = None) -> LightBudget:
         """Which magnitudes this monitor, sprite and quantisation can show, and how accurately, by
@@ -369,6 +392,7 @@ class OpenBench(Bench):
         from hilstar.instruments.simulate.budget import budget
         from hilstar.tracker.centroiders import FAMILY
 
+        self._refuse_closed("budget")
         choices = (*FAMILY, "all")
         if centroider is not None and centroider not in choices:
             raise InputError(
@@ -381,7 +405,12 @@ class OpenBench(Bench):
         simulator = self.__dict__.pop("_simulator", None)
         if simulator is not None:
             simulator.close()
+        self.__dict__["_closed"] = True
         super().close()
+
+    def _refuse_closed(self, what: str) -> None:
+        if self.__dict__.get("_closed"):
+            raise InputError(f"{what}: the bench is closed; open it again with hilstar.load")
 
     @cached_property
     def _fields_of_view(self) -> FieldsOfView:
@@ -427,10 +456,16 @@ def assess(
     """
     from hilstar.instruments.assess.assessment import AssessSettings, assess_files
 
+    if stamp not in {None, "start", "middle", "end"}:
+        raise InputError(f"stamp {shortened(repr(stamp))}: write start, middle or end")
     settings = AssessSettings(
         stamp, seconds_of(latency_s, "latency_s"), whole_of(display_attitudes, "display_attitudes")
     )
-    return assess_files(Path(ledger), None if telemetry is None else Path(telemetry), settings)
+    return assess_files(
+        path_of(ledger, "ledger"),
+        None if telemetry is None else path_of(telemetry, "telemetry"),
+        settings,
+    )
 
 
 def _unit_of(column: str) -> str | None:

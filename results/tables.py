@@ -502,7 +502,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry", "lost")
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "stellarium")
 
 
 def beside_table(name: str) -> str:

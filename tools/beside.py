@@ -22,6 +22,9 @@ PROGRAMS = {
     "galsim": "",
     "astrometry": "Debian's astrometry.net",
     "lost": "UWCubeSat/lost, built, its folder as the environment's LOST",
+    "basilisk": "",
+    "pyxel": "pyxel-sim in an environment of its own, whose Python is the environment's PYXEL",
+    "stellarium": "Debian's stellarium, xvfb and xauth",
 }
 
 

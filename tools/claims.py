@@ -1,8 +1,9 @@
 """The matrix of claims: what holds each figure of README and docs.
 
-`python tools/claims.py` writes docs/claims.md and README's sum from claims.toml. `--renew FILE`
-first takes last values and dates from FILE, which tests write that run with HILSTAR_CLAIMS=FILE
-(`holds` in tests/support/claims.py).
+`python tools/claims.py` writes docs/claims.md and README's sum from claims.toml. FILE is what tests
+write that run with HILSTAR_CLAIMS=FILE (`holds` in tests/support/claims.py): `--renew FILE` first
+takes last values and dates from it, `--check FILE` of a whole run writes nothing and names the
+claims that it did not measure, or measured far below what was measured last.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ AT_MOST, ABOUT = "at most", "about"
 MIN_OUTSIDE_SHARE = 0.9  # of the rows that are neither times nor settings
 # A figure that is an upper limit is not told twice as large as what was measured.
 MIN_OF_LIMIT = 0.5
+# A run that measures less than this of the last value measures something else.
+MIN_OF_LAST = 0.5
 MARK = re.compile(r"<!-- claim: ([\w.-]+) -->")
 SUM = re.compile(r"(<!-- sum of claims -->)(.*?)(<!-- end -->)", re.DOTALL)
 NUMBER = r"\d[\d ]*(?:\.\d+)?(?:e[-+]?\d+)?"
@@ -86,6 +89,12 @@ class Claim:
         """Whether something that is not hilstar's own holds it."""
         return self.oracle in OUTSIDE
 
+    def is_loose(self) -> bool:
+        """Whether it is an upper limit over twice what was measured last."""
+        if self.sense != AT_MOST or " to " in self.value:
+            return False
+        return max(self.lasts()) < MIN_OF_LIMIT * float(self.value.replace(" ", ""))
+
     def figure(self) -> str:
         """The value with its unit."""
         return f"{self.value} {self.unit}".strip()
@@ -94,7 +103,7 @@ class Claim:
 @dataclass(frozen=True)
 class Table:
     """A table that `results/tables.py` makes of `file`, and what its kind of figures is held
-    against.
+    against. A name that ends in "*" stands for all others that begin so.
     """
 
     name: str
@@ -204,7 +213,8 @@ def page(root: Path = ROOT) -> str:
     lines += ["| table | file | oracle | shared with hilstar | test |", "|---|---|---|---|---|"]
     for table in tables_of(root):
         places = [name for name, text in pages.items() if f"<!-- table: {table.name} -->" in text]
-        of = f"{table.what} ({', '.join(link(place) for place in places)})"
+        linked = ", ".join(link(place) for place in places)
+        of = f"{table.what} ({linked})" if places else table.what
         cells = [of, f"`{table.file}`", oracle_of(table), table.shares, test_of(table.test)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
@@ -278,13 +288,45 @@ def renewed(text: str, records: list[dict[str, str]], today: datetime.date) -> s
     return "".join(blocks)
 
 
+def records_of(path: Path) -> list[dict[str, str]]:
+    """What tests recorded."""
+    return [json.loads(record) for record in path.read_text("utf-8").splitlines()]
+
+
+def strayed(claims: list[Claim], records: list[dict[str, str]]) -> list[str]:
+    """What a whole run did not measure, or measured far below the last value: what a test hands
+    over, or its oracle, is then another.
+    """
+    values: dict[str, list[float]] = {}
+    for record in records:
+        values.setdefault(record["claim"], []).append(float(record["value"]))
+    found = []
+    for claim in claims:
+        if not claim.test:
+            continue
+        last = max(claim.lasts())
+        if claim.id not in values:
+            found.append(f"{claim.id}: {claim.test} did not measure it")
+        elif claim.kind != "accuracy" or claim.is_loose():
+            continue  # of a limit that is far off, any run may be further off
+        elif max(values[claim.id]) < MIN_OF_LAST * last:
+            found.append(f"{claim.id}: {max(values[claim.id]):.3g}, and {last:.3g} before")
+    return found
+
+
 def main() -> None:
-    """Write the page and the sum."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Write the page and the sum, or check a run. Raises SystemExit where it strayed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", type=Path, metavar="FILE", help="what HILSTAR_CLAIMS recorded")
     parser.add_argument("--renew", type=Path, metavar="FILE", help="what HILSTAR_CLAIMS recorded")
     given = parser.parse_args()
+    if given.check is not None:
+        found = strayed(claims_of(), records_of(given.check))
+        raise SystemExit("\n".join(found) if found else None)
     if given.renew is not None:
-        records = [json.loads(record) for record in given.renew.read_text("utf-8").splitlines()]
+        records = records_of(given.renew)
         path = ROOT / ROWS
         text = path.read_text("utf-8")
         path.write_text(renewed(text, records, datetime.date.today()), "utf-8")

@@ -25,11 +25,24 @@ TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 HEAD = f"""\
 # Commands
 
-`hilstar COMMAND -h` (or `--help`) prints the same for one command, and `hilstar --version` the version. This page is generated
-from the commands themselves (`python tools/make_pages.py`).
+`hilstar help COMMAND` (or `hilstar COMMAND -h`) prints the same for one command, and `hilstar --version` the version. This page is
+generated from the commands themselves (`python tools/make_pages.py`).
 
 Every command that has `--json` then prints one JSON object on stdout and nothing else there. An output named `-`
 is stdout, for CSV and TOML alone; what the command says then goes to stderr.
+
+An option of several commands has one meaning in all of them:
+
+| option | meaning |
+|---|---|
+| `--frames N` | how many frames |
+| `--rate HZ` | how many a second: packets, or answers |
+| `--at SECONDS` | the moment, after `[sky] epoch_utc` or in a scenario |
+| `--to TARGET` | where packets go |
+| `--duration SECONDS` | how long a command runs |
+| `--wait SECONDS` | how long it waits for the other side |
+| `--feed ENDPOINT` | where frames go to whoever watches |
+| `--radec`, `--star`, `--quaternion` | where the camera points |
 
 | exit code | meaning |
 |---|---|

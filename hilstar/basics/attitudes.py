@@ -7,6 +7,7 @@ SciPy and Astropy are known by the module of a value's type: neither is imported
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,9 +61,45 @@ def quaternion_of(attitude: Any, roll_deg: Any = None) -> FloatArray:
     array = _plain(attitude, "attitude", "1", FOUR_NUMBERS)
     if array.shape == (3,):
         raise InputError(f"attitude of 3 numbers: {FOUR_NUMBERS}; {FROM_RADEC}")
+    if array.shape == ():
+        raise InputError(f"attitude {shortened(repr(attitude))}: {FOUR_NUMBERS}; {FROM_RADEC}")
     if array.shape != (4,):
         raise InputError(f"attitude of shape {array.shape}: {FOUR_NUMBERS}")
     return array
+
+
+def quaternions_of(attitudes: Any, name: str) -> FloatArray:
+    """Quaternions (..., 4), scalar first, of numbers or of a SciPy Rotation; their norms are not
+    checked. Raises InputError.
+    """
+    if type(attitudes).__module__.startswith("scipy.spatial"):
+        scalar_last = np.asarray(attitudes.as_quat(), dtype=np.float64)
+        return scalar_last[..., [3, 0, 1, 2]]
+    return numbers_of(attitudes, name, (..., 4), "1", "of unit quaternions, or a Rotation")
+
+
+def numbers_of(values: Any, name: str, axes: tuple[Any, ...], unit: str, what: str) -> FloatArray:
+    """Numbers in a unit, float64, of an array or an Astropy quantity. Raises InputError, which says
+    `what` they are of.
+
+    `axes` is the shape: a length, "n" for any, and a leading `...` for any axes before.
+    """
+    words = ["..." if length is ... else str(length) for length in axes]
+    form = f"write an array ({', '.join(words)}) {what}"
+    array = _plain(values, name, unit, form)
+    last = axes[1:] if axes[:1] == (...,) else axes
+    has_axes = array.ndim == len(axes) if last is axes else array.ndim >= len(last)
+    seen = array.shape[array.ndim - len(last) :]
+    if not has_axes or any(a not in ("n", b) for a, b in zip(last, seen, strict=True)):
+        raise InputError(f"{name} of shape {array.shape}: {form}")
+    return array
+
+
+def path_of(path: Any, name: str) -> Path:
+    """A path of a text or a path. Raises InputError."""
+    if not isinstance(path, (str, Path)):
+        raise InputError(f"{name} {shortened(repr(path))}: write the path of a file")
+    return Path(path)
 
 
 def rate_of(rate: Any, name: str = "rate_cam_rad_s") -> FloatArray:
@@ -87,13 +124,17 @@ def seconds_of(duration: Any, name: str) -> float:
     return _scalar(duration, name, "s", "write a number of seconds, or an Astropy quantity")
 
 
-def whole_of(number: Any, name: str, minimum: int = 0) -> int:
-    """A whole number from `minimum` on. Raises InputError."""
+def share_of(share: Any, name: str) -> float:
+    """A plain number, of a number or a quantity without unit. Raises InputError."""
+    return _scalar(share, name, "1", "write a number")
+
+
+def whole_of(number: Any, name: str, minimum: int = 0, maximum: int | None = None) -> int:
+    """A whole number from `minimum` to `maximum`, if there is one. Raises InputError."""
     is_whole = isinstance(number, (int, np.integer)) and not isinstance(number, bool)
-    if not is_whole or number < minimum:
-        raise InputError(
-            f"{name} {shortened(repr(number))}: write a whole number from {minimum} on"
-        )
+    if not is_whole or number < minimum or (maximum is not None and number > maximum):
+        limits = f"from {minimum} on" if maximum is None else f"from {minimum} to {maximum}"
+        raise InputError(f"{name} {shortened(repr(number))}: write a whole number {limits}")
     return int(number)
 
 

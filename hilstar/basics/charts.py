@@ -423,11 +423,10 @@ def svg(figure: "Figure") -> str:
     data = io.StringIO()
     with rc_context({"svg.hashsalt": "hilstar"}):  # the same figure is the same file
         figure.savefig(data, format="svg", metadata={"Date": None})
-    rules = "".join(
-        f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
-        for light, dark in DARK.items()
-        for what in ("fill", "stroke")
-    )
+    rules = ""
+    for light, dark in DARK.items():
+        for what in ("fill", "stroke"):
+            rules += f'[style*="{what}: {light}"]{{{what}:{dark}!important}}'
     return data.getvalue().replace(
         "</style>", f"@media (prefers-color-scheme: dark){{{rules}}}</style>", 1
     )

@@ -321,7 +321,8 @@ def key_table(rows: Iterable[tuple[object, object]]) -> str:
     lines = []
     for name, text in rows:
         lines.append(f'<tr><th scope="row">{escaped(name)}</th><td>{escaped(text)}</td></tr>')
-    return f"{WIDE_TABLE}<table>{''.join(lines)}</table></div>"
+    body = "".join(lines)
+    return f'{WIDE_TABLE}<table class="keys">{body}</table></div>'
 
 
 def table_of(

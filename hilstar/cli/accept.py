@@ -63,7 +63,7 @@ def accept(
         Option(metavar="SOLVER", help="What is tested, as in a campaign; not on a real bench."),
     ] = CENTROIDS,
     solver_timeout: Annotated[
-        float, Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)
+        float, Option(metavar="SECONDS", help="Time limit of one image.", min=0.01, max=86400)
     ] = 10.0,
     headless: Headless = False,
     windowed: running.Windowed = False,

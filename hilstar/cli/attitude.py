@@ -126,8 +126,9 @@ def _of_log(path: Path, time: str | None, stated: "Stated") -> _Found:
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
     from hilstar.attitude.wire.packet import AttitudeSample
 
-    log = open_log(path, stated)
-    joins = log.joins()
+    with busy("reading the log"):
+        log = open_log(path, stated)
+        joins = log.joins()
     for _, line in [*log.told, *joins.told]:
         say(line)
     t_ns = time_in_log(path, log.samples, time)

@@ -7,7 +7,7 @@ from typer import Argument
 
 from hilstar.basics.units import NS_PER_S
 from hilstar.cli import options
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import busy, print_found, say
 
 
 @options.log_statements
@@ -22,14 +22,16 @@ def convert(
     from hilstar.attitude.logs.log_file import open_log, write_log
 
     options.check_files([log], [output])
-    read = open_log(log, statements.stated())
-    notes = [line for _, line in [*read.told, *coarse_lines(read.samples)]]
-    doubt = read.joins().doubt
+    with busy("reading the log"):
+        read = open_log(log, statements.stated())
+        notes = [line for _, line in [*read.told, *coarse_lines(read.samples)]]
+        doubt = read.joins().doubt
     if doubt:
         notes.append(doubt)
     for line in notes:
         say(line)
-    write_log(output, read.samples, read.conventions.scale)
+    with busy("writing the log"):
+        write_log(output, read.samples, read.conventions.scale)
     fields = {
         "attitudes": len(read.samples),
         "duration_s": (read.samples[-1].t_ns - read.samples[0].t_ns) / NS_PER_S,

@@ -53,12 +53,12 @@ def first_light(
     grab: Annotated[
         str | None,
         Option(
-            metavar="CMD",
+            metavar="CMD|genicam:NAME",
             help=(
                 "Command that takes the tracker's image: {output} is the file to write; {pattern},"
                 " where the command shows"
                 " the pattern itself, a picture of it; {exposure_s}, where it can be set, the"
-                " exposure."
+                " exposure. Or a camera: genicam: and its serial number, VENDOR-MODEL or address."
             ),
         ),
     ] = None,

@@ -35,7 +35,7 @@ Grab = Annotated[
 Exposure = Annotated[
     float | None,
     Option(
-        metavar="S",
+        metavar="SECONDS",
         help="With --grab: the exposure; by default the bench file's.",
         min=1e-6,
         max=3600,

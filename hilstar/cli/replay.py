@@ -11,7 +11,7 @@ from hilstar.basics.notices import Notices
 from hilstar.cli import options, running
 from hilstar.cli.completion import offered
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
-from hilstar.server.console.terminal import say
+from hilstar.server.console.terminal import busy, say
 
 
 @options.log_statements
@@ -86,9 +86,9 @@ def replay(
     split = options.parse_split(ledger_split)
     notices = Notices()
     stated = statements.stated(file.config)
-    play = plan_play(
-        log, Wanted(options.parse_speed(speed), start, stop, step), file.config, stated
-    )
+    wanted = Wanted(options.parse_speed(speed), start, stop, step)
+    with busy("reading the log"):
+        play = plan_play(log, wanted, file.config, stated)
     file = with_codes_ms(dated(file, play.conventions.scale, play.first_ns), play.codes_ms)
     with (
         running.page_listener(console, control, token, console_name) as listener,

@@ -17,7 +17,7 @@ from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.programs import Service
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.console.run_status import RunStatus
-from hilstar.server.console.terminal import report, say
+from hilstar.server.console.terminal import busy, report, say
 
 if TYPE_CHECKING:
     from hilstar.server.bench.bench_file import BenchFile
@@ -161,7 +161,8 @@ def effort_of_run(bench: Any, explain: bool, as_json: bool) -> dict[str, dict[st
     """The key "effort" of a run's JSON, where the bench leaves something to its tolerance or it
     is to be explained; else {}.
     """
-    return explained_effort(bench, as_json and (explain or bench.effort.is_chosen))
+    with busy("finding what else would do"):
+        return explained_effort(bench, as_json and (explain or bench.effort.is_chosen))
 
 
 def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:

@@ -62,7 +62,7 @@ def simulate(
     import numpy as np
 
     from hilstar.instruments.simulate import pictures as files
-    from hilstar.instruments.simulate.batch import faulty_exposure
+    from hilstar.instruments.simulate.exposures import faulty_exposure
     from hilstar.instruments.simulate.simulator import FrameNoise, Simulator
     from hilstar.optics.layers.truth import clipped_in
     from hilstar.server.bench.bench_file import at_moment, read_bench_file
@@ -143,7 +143,8 @@ def simulate_log(
 ) -> None:
     """The virtual tracker along a log."""
     from hilstar.attitude.logs.log_file import open_log
-    from hilstar.instruments.simulate.batch import LogFaults, log_views, simulate_views
+    from hilstar.instruments.simulate.batch import simulate_views
+    from hilstar.instruments.simulate.exposures import LogFaults, log_views
     from hilstar.server.bench.bench_file import dated, read_bench_file
 
     wrong = optional_scenario(scenario)

@@ -190,9 +190,9 @@ class _Smear:
             ].reshape(3, -1)
         x_px, y_px = paths.all_places_px(thrice_s)
         # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
-        length = sum(
-            Chords(x_px[k : k + 2], y_px[k : k + 2]).length_sigma(self.psf.width_px) for k in (0, 1)
-        )
+        first_half, second_half = Chords(x_px[:2], y_px[:2]), Chords(x_px[1:], y_px[1:])
+        length = first_half.length_sigma(self.psf.width_px)
+        length = length + second_half.length_sigma(self.psf.width_px)
         whole = Chords(x_px[::2], y_px[::2])
         bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
         begin, end = whole.on_image(camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)

@@ -212,14 +212,9 @@ class Chords:
         """How long each is in widths of a PSF (see `Psf.width_px`); NaN where an end is behind
         the camera.
         """
-        return np.asarray(
-            np.hypot(
-                *(
-                    np.diff(ends, axis=0)[0] / s
-                    for ends, s in zip((self.x_px, self.y_px), width_px, strict=True)
-                )
-            )
-        )
+        across = (self.x_px[1] - self.x_px[0]) / width_px[0]
+        down = (self.y_px[1] - self.y_px[0]) / width_px[1]
+        return np.asarray(np.hypot(across, down))
 
     def on_image(
         self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike

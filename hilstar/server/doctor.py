@@ -38,7 +38,7 @@ from hilstar.server.bench.measured_on import MonitorCheck, check_monitor
 from hilstar.server.bench.monitor import bench_calibration
 from hilstar.server.bench.star_rates import bench_optics
 from hilstar.server.bench.star_size import StarSize, star_size
-from hilstar.server.genicam.camera import INSTALL, has_aravis, list_cameras
+from hilstar.server.genicam.camera import INSTALL, child_command, list_cameras
 from hilstar.sky.catalog import load_catalog
 
 USUAL_BITS = 8
@@ -128,7 +128,7 @@ def examine() -> Examination:
 
 def _cameras() -> Check:
     """The cameras that `--grab genicam:` can open."""
-    if not has_aravis():
+    if child_command() is None:
         return Check("cameras", ok=False, detail=f"not looked for: {INSTALL}", required=False)
     lines = [
         "{vendor}-{model}, serial {serial}, at {address} ({protocol})".format(**camera)

@@ -32,7 +32,7 @@ from hilstar.attitude.wire.roads import LinkCounts
 from hilstar.attitude.wire.serial_link import SerialLink, serial_target
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqSender
-from hilstar.basics.attitudes import quaternion_of, rate_of, t_ns_of
+from hilstar.basics.attitudes import quaternion_of, rate_of, seconds_of, t_ns_of, whole_of
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.interrupts import caught
@@ -218,7 +218,11 @@ class Sender(Closing):
         clock: Clock = time.monotonic_ns,
         sender: int = 0,
     ) -> None:
-        if not 0 <= sender <= MAX_SENDER:
+        if not isinstance(to, str):
+            raise InputError(f"to {shortened(repr(to))}: write a road such as tcp://127.0.0.1:5560")
+        if not callable(clock):
+            raise InputError(f"clock {shortened(repr(clock))}: write a function that returns ns")
+        if whole_of(sender, "sender") > MAX_SENDER:
             raise InputError(f"sender {sender}: write 1 to {MAX_SENDER}, or 0 for no number")
         self._number = sender
         files = (secret_key, server_key, allowed_clients)
@@ -226,6 +230,7 @@ class Sender(Closing):
         self._clock = clock
         self._end = open_sender(to, connect=connect, keys=keys, clock=clock)
         self._sequence = 0
+        self._closed = False
 
     @property
     def endpoint(self) -> str:
@@ -250,7 +255,7 @@ class Sender(Closing):
         """True once hilstar listens: a subscriber (ZeroMQ), an answer (UDP), or at once where
         the road cannot tell (serial).
         """
-        return self._end.wait_for_listener(timeout_s)
+        return self._end.wait_for_listener(seconds_of(timeout_s, "timeout_s"))
 
     def send(
         self,
@@ -270,7 +275,9 @@ class Sender(Closing):
         `discontinuity` says that the attitude jumped. Raises InputError for what hilstar would
         refuse. Only a full serial line is waited for, half a second at most.
         """
-        at_ns = self._clock() if t_ns is None else t_ns_of(t_ns)
+        if self._closed:
+            raise InputError("send: the sender is closed; make another one")
+        at_ns = t_ns_of(self._clock(), "clock") if t_ns is None else t_ns_of(t_ns)
         q = tuple(quaternion_of(q_icrs_to_cam, roll_deg).tolist())
         rate = None if rate_cam_rad_s is None else tuple(rate_of(rate_cam_rad_s).tolist())
         sample = checked_sample(at_ns, q, rate, self._sequence, discontinuity, self._number)
@@ -281,4 +288,5 @@ class Sender(Closing):
 
     def close(self) -> None:
         """Close the road; what was sent over ZeroMQ or a serial line leaves first."""
+        self._closed = True
         self._end.close()

@@ -34,10 +34,11 @@ class _Zone(NamedTuple):
 def _zones() -> tuple[_Zone, ...]:
     with ZONES.open(encoding="utf-8", newline="") as file:
         rows = csv.DictReader(line for line in file if not line.startswith("#"))
-        return tuple(
-            _Zone(float(row["from_h"]), float(row["to_h"]), float(row["lowest_deg"]), row["name"])
-            for row in rows
-        )
+        zones = []
+        for row in rows:
+            from_h, to_h = float(row["from_h"]), float(row["to_h"])
+            zones.append(_Zone(from_h, to_h, float(row["lowest_deg"]), row["name"]))
+        return tuple(zones)
 
 
 def constellation_of(direction_icrs: FloatArray) -> str:
@@ -46,12 +47,8 @@ def constellation_of(direction_icrs: FloatArray) -> str:
     hours = float(np.degrees(np.arctan2(y, x)) % 360) / 15
     dec_deg = float(np.degrees(np.arctan2(z, np.hypot(x, y))))
     zones = _zones()
-    # The last zone is the whole of the south polar cap.
-    return next(
-        (
-            zone.name
-            for zone in zones
-            if zone.from_h <= hours < zone.to_h and dec_deg >= zone.lowest_deg
-        ),
-        zones[-1].name,
-    )
+    for zone in zones:
+        if zone.from_h <= hours < zone.to_h and dec_deg >= zone.lowest_deg:
+            return zone.name
+    # the south polar cap, below the lowest of all
+    return zones[-1].name

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.sky.electrons import SUN_TEMPERATURE_K, Optics, electron_response
 from hilstar.sky.spectrum import DATA_DIR, blackbody_exitance_w_m2_m, read_curve_csv
 
@@ -74,10 +74,8 @@ class TabledLight(NamedTuple):
 def tabled_light(seen: Sunward) -> TabledLight:
     """Table 17 in directions (n,)."""
     dlon_deg, lat_deg, log_radiance, blank = _table_17()
-    i, j = (
-        np.clip(np.searchsorted(axis, at, side="right") - 1, 0, len(axis) - 2)
-        for axis, at in ((dlon_deg, seen.dlon_deg), (lat_deg, seen.lat_deg))
-    )
+    i = _interval_of(dlon_deg, seen.dlon_deg)
+    j = _interval_of(lat_deg, seen.lat_deg)
     u = (seen.dlon_deg - dlon_deg[i]) / (dlon_deg[i + 1] - dlon_deg[i])
     v = (seen.lat_deg - lat_deg[j]) / (lat_deg[j + 1] - lat_deg[j])
     corners = (
@@ -89,6 +87,11 @@ def tabled_light(seen: Sunward) -> TabledLight:
     value = np.sum([share * log_radiance[row, column] for row, column, share in corners], axis=0)
     missing = np.sum([share * blank[row, column] for row, column, share in corners], axis=0)
     return TabledLight(np.exp(value), missing < ROUNDING)
+
+
+def _interval_of(axis: FloatArray, places: FloatArray) -> IntArray:
+    """The interval of an axis in which each place lies; beyond the axis its first or last one."""
+    return np.clip(np.searchsorted(axis, places, side="right") - 1, 0, len(axis) - 2)
 
 
 @cache

@@ -79,11 +79,9 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
     x, y = (np.clip(place, -half, half) for place in first)
     for _ in range(FIT_STEPS):
         shares = told(x, y)
-        slopes = [
-            (told(x + dx, y + dy) - told(x - dx, y - dy)) / (2 * SLOPE_PX)
-            for dx, dy in ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
-        ]
-        parts = np.stack([shares, *slopes], axis=1).reshape(len(stamps), 3, -1)
+        by_x = (told(x + SLOPE_PX, y) - told(x - SLOPE_PX, y)) / (2 * SLOPE_PX)
+        by_y = (told(x, y + SLOPE_PX) - told(x, y - SLOPE_PX)) / (2 * SLOPE_PX)
+        parts = np.stack([shares, by_x, by_y], axis=1).reshape(len(stamps), 3, -1)
         normal = parts @ parts.transpose(0, 2, 1)
         right_side = parts @ stamps.reshape(len(stamps), -1, 1)
         normal += (

@@ -275,6 +275,23 @@ def test_stars_twinkle_by_youngs_law(tmp_path):
     assert scintillation(18.4, np.array([1.0, 2.0]), 0.0, exposure_s=0.0).tolist() == [1.0, 1.0]
 
 
+def test_scintillation_is_young_s_for_an_aperture_in_centimetres():
+    """0.09 D^(-2/3) X^1.75 exp(-h / 8 km) / sqrt(2 t) (Young 1967), and never above MAX_TWINKLE."""
+    masses = np.array([1.0, 1.6])
+    wanted = 0.09 * 1.84 ** (-2 / 3) * masses**1.75 * math.exp(-1200 / 8000) / math.sqrt(2 * 0.2)
+    np.testing.assert_allclose(scintillation(18.4, masses, 1200.0, 0.2), wanted)
+
+
+def test_stars_twinkle_and_bodies_do_not(rng):
+    _, stars, moving = stars_and_sky()
+    among = moving.among(stars)
+    seen = replace(among, bodies=("Moon", "Jupiter"))
+    twinkled = moving.air.twinkling(seen, moving.utc_ns(0), 0.2, rng)
+    share = twinkled.electrons_per_s / seen.electrons_per_s
+    assert (share[-2:] == 1.0).all()
+    assert (share[:-2] != 1.0).all()
+
+
 def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
     """An attitude towards the north at an altitude."""
     east = np.cross([0.0, 0.0, 1.0], up)

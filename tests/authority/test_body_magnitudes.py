@@ -97,6 +97,34 @@ def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
             )
 
 
+def test_the_moon_dims_by_the_squares_of_both_distances():
+    """By 0.07 mag from perihelion to aphelion."""
+    near, far = (body_v_mag("Moon", *at(sun, 0.00257, 40.0), 2020.0) for sun in (0.983, 1.017))
+    assert far - near == pytest.approx(5 * np.log10(1.017 / 0.983), abs=1e-9)
+    close, wide = (body_v_mag("Moon", *at(1.0, au, 40.0), 2020.0) for au in (0.0024, 0.0027))
+    assert wide - close == pytest.approx(5 * np.log10(0.0027 / 0.0024), abs=1e-9)
+
+
+def test_saturn_s_rings_do_not_count_from_their_dark_side():
+    """Sun and observer 2 degrees from the plane: on one side of it the rings add 0.06 mag."""
+    pole = light._POLES["Saturn"]
+    across = np.cross(pole, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+
+    def mag(sun_deg: float, observer_deg: float) -> float:
+        sun, observer = (
+            9.5 * KM_PER_AU * (np.cos(a) * across - np.sin(a) * pole)
+            for a in np.radians([sun_deg, observer_deg])
+        )
+        return body_v_mag("Saturn", sun, observer, 2020.0)
+
+    phase_deg = 4.0
+    globe = -8.914 + 0.026 * phase_deg + 10 * np.log10(9.5)
+    assert mag(2.0, -2.0) == pytest.approx(globe, abs=1e-6)
+    assert mag(-2.0, 2.0) == pytest.approx(globe, abs=1e-6)
+    assert mag(2.0, 2.0) < globe - 0.026 * phase_deg - 0.05
+
+
 def rolo_albedo(phase_deg: float) -> float:
     """Disk-equivalent reflectance at 549.1 nm without libration (Kieffer and Stone 2005, eq. 10,
     table 4).

@@ -11,14 +11,23 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.display.window.output_settings import PITCH_TOLERANCE
+from hilstar.instruments.compare import sky_comparison
+from hilstar.instruments.confront.report import MAX_RMS_MAG, MAX_RMS_PX
 from hilstar.instruments.simulate.star_finder import MATCH_PX
 from hilstar.instruments.study.predictors import JITTER
 from hilstar.instruments.study.sweep import BUSY_SHARE
+from hilstar.optics.layers.bodies import HIDDEN
+from hilstar.optics.layers.view import POINT_PX
+from hilstar.optics.psf import MAX_NEGATIVE
+from hilstar.server.bench.config.hardware import Verify
 from hilstar.server.bench.config.render import (
     DEFAULT_TOLERANCE_MAG,
     DEFAULT_TOLERANCE_PX,
     RenderSettings,
 )
+from hilstar.server.bench.frame_files import MAX_SIP_PX
+from hilstar.server.summary import MAX_LATE_SHARE
 from tests.support import claims as support
 from tests.support.benches import ROOT
 from tests.support.claims import faults, holds, rows
@@ -51,15 +60,35 @@ def test_times_are_those_of_the_results():
     holds("frame-1000-h100", float(card["median_ms"]))
     fewest = min(times("scale", axis="packets"), key=lambda row: float(row["at"]))
     holds("frames-share", float(fewest["time"]))
+    for workers in ("1", "2"):
+        (row,) = times("scale", axis="workers", at=workers)
+        holds(f"case-by-{workers}", float(row["time"]))
+    (row,) = times("scale", axis="stars", at="1000000")
+    holds("memory-of-a-million", float(row["memory_mb"]))
 
 
 def test_settings_are_those_of_the_code():
     holds("shake", max(size_arcsec for size_arcsec, _ in JITTER))
-    holds("lost-star", MATCH_PX)
+    for claim in ("lost-star", "match-px"):
+        holds(claim, MATCH_PX)
     holds("busy-share", 100 * BUSY_SHARE)
     holds("tolerance-mag", DEFAULT_TOLERANCE_MAG)
     holds("tolerance-px", DEFAULT_TOLERANCE_PX)
     holds("sprite-sigma", max(RenderSettings().sprite_sigma_px))
+    verify = Verify()
+    holds("verify-mag", verify.flux_mag)
+    holds("verify-px", verify.centroid_px)
+    holds("verify-lost", 100 * verify.lost_share)
+    holds("compare-mag", sky_comparison.FLUX_MAG)
+    holds("compare-px", sky_comparison.CENTROID_PX)
+    holds("confront-px", MAX_RMS_PX)
+    holds("confront-mag", MAX_RMS_MAG)
+    holds("disc-px", POINT_PX)
+    holds("hidden-share", 100 * HIDDEN)
+    holds("negative-share", 100 * MAX_NEGATIVE)
+    holds("sip-limit", MAX_SIP_PX)
+    holds("pitch-share", 100 * PITCH_TOLERANCE)
+    holds("late-share", 100 * MAX_LATE_SHARE)
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +166,8 @@ def test_too_few_oracles_outside_are_found(falsified):
     assert any("figures have an outside oracle" in one for one in found)
 
 
-def test_a_measured_value_has_to_leave_the_figure_true():
+def test_a_measured_value_has_to_leave_the_figure_true(monkeypatch):
+    monkeypatch.delenv(support.RECORDS, raising=False)  # what is planted here was not measured
     low, high = rows()[ROW].bound()
     holds(ROW, high)
     with pytest.raises(
@@ -168,3 +198,13 @@ def test_values_of_a_run_become_the_last_ones(tmp_path, monkeypatch):
     assert [one.id for one in changed] == [ROW]
     assert (changed[0].last, changed[0].date) == (0.0064, today)
     assert changed[0].version == lines[0]["version"] != ""
+
+
+def test_a_run_that_measures_less_or_nothing_is_found():
+    """As a test whose value is divided by ten would, which is within any upper limit."""
+    row = rows()[ROW]
+    whole = [{"claim": ROW, "value": str(row.last), "version": ""}]
+    tenth = [{"claim": ROW, "value": str(float(row.last) / 10), "version": ""}]
+    assert tool.strayed([row], whole) == []
+    assert tool.strayed([row], tenth) == [f"{ROW}: 0.000663, and 0.00663 before"]
+    assert tool.strayed([row], []) == [f"{ROW}: {row.test} did not measure it"]

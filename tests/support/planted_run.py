@@ -28,11 +28,12 @@ def write_ledger(
     records: Sequence[AnswerRecord | FaultRecord] = (),
     bench: str = SMALL_BENCH,
     missed_before: Sequence[int] = (),
+    markers: Sequence[int] = (),
 ) -> Path:
     """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the
     attitudes (n, 4), or none.
 
-    The sender's clock is the host's; `records` are written among the frames by their host time.
+    The sender's clock is the host's; `markers` are the photodiode square's levels, and `records` are written among the frames by their host time.
     """
     head = {
         "bench_text": bench,
@@ -57,6 +58,7 @@ def write_ledger(
                 frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q
             )
             record.missed_before = missed_before[number] if missed_before else 0
+            record.marker = markers[number] if markers else None
             writer.add("frame", t_ns, msgspec.json.encode(record), number)
         writer.flush()
         writer.finish()

@@ -235,7 +235,7 @@ class Cause:
         return RATES if self.reading is None else CONVENTION
 
     def error(self, stretch: Stretch) -> float:
-        """How far turn and rate of a stretch are apart without it, rad/s."""
+        """How far turn and rate of a stretch are apart once the cause is mended, rad/s."""
         if self.reading is None:
             turn = stretch.turn
         else:
@@ -307,6 +307,11 @@ CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
 READ_OTHERWISE = tuple(read_otherwise(readings()))
 
 
+def _sums_from_zero(steps: FloatArray) -> FloatArray:
+    """The sums (n + 1, k) of steps (n, k) up to each, from 0."""
+    return np.vstack((np.zeros(steps.shape[1]), np.cumsum(steps, axis=0)))
+
+
 def _turns_rad(q: FloatArray) -> FloatArray:
     """The turn (n - 1, 3) from each attitude (n, 4) to the next, as a rate times a second."""
     return -to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
@@ -331,10 +336,10 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     count = int(whole.sum())
     if count < max(MIN_INTERVALS, (len(samples) - 1) / 2):
         return None
-    at_s, turned, summed, as_icrs = (
-        np.vstack((np.zeros(part.shape[1]), np.cumsum(part[whole], axis=0)))
-        for part in (step_s, turn_rad, mean * step_s, rotate(q[1:], mean) * step_s)
-    )
+    at_s = _sums_from_zero(step_s[whole])
+    turned = _sums_from_zero(turn_rad[whole])
+    summed = _sums_from_zero((mean * step_s)[whole])
+    as_icrs = _sums_from_zero((rotate(q[1:], mean) * step_s)[whole])
     weight = at_s[:, 0] - at_s.mean()
     spread_s2 = float(weight @ weight)
     turn = weight @ turned / spread_s2
@@ -392,8 +397,8 @@ def cause_of(
 
 
 def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
-    """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far
-    better than with it.
+    """Whether a cause explains the rates: mended of it they fit, all but one in MORE_STRETCHES of
+    the stretches, and their median error falls to a third (MIN_BETTER) or less.
     """
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
     errors = [cause.error(stretch) for stretch in stretches]
@@ -617,7 +622,9 @@ def _noise(stretches: Sequence[Stretch]) -> float:
 
 
 def _joined(parts: Sequence[FloatArray]) -> FloatArray:
-    """Sums (n, 3) that begin at 0 each, as one that goes on."""
+    """One running sum (n, 3), from 0, of the running sums of successive stretches, each of which
+    begins at 0.
+    """
     ends = np.cumsum([part[-1] for part in parts], axis=0)
     begins = np.vstack((np.zeros(3), ends[:-1]))
     return np.vstack(
@@ -632,8 +639,8 @@ def _between(t_s: FloatArray, summed: FloatArray, edges_s: FloatArray) -> FloatA
 
 
 def _least(lags_s: FloatArray, off: FloatArray) -> float:
-    """The lag of the smallest error: the shortest of those that are nearly as good, as in a
-    swing a whole period more is.
+    """The lag with the smallest error. Of those nearly as good the shortest: in a periodic swing a
+    lag that is a whole period longer fits as well.
     """
     good = lags_s[off <= off.min() + LAG_TIE * (off.max() - off.min())]
     return float(good[np.abs(good).argmin()])

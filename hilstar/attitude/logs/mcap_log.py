@@ -198,14 +198,10 @@ def topics_of(path: Path) -> list[str]:
 
 def read_metadata(path: Path, name: str) -> dict[str, str]:
     """The first metadata of that name, {} where there is none. Raises InputError for damage."""
-    return next(
-        (
-            dict(r.metadata)
-            for r in records_of(path)
-            if isinstance(r, kinds.Metadata) and r.name == name
-        ),
-        {},
-    )
+    for record in records_of(path):
+        if isinstance(record, kinds.Metadata) and record.name == name:
+            return dict(record.metadata)
+    return {}
 
 
 def begins_as_ledger(path: Path) -> bool:
@@ -231,20 +227,15 @@ def holds_ros(path: Path) -> bool:
     """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for
     damage before it.
     """
-    channels = (record for record in records_of(path) if isinstance(record, kinds.Channel))
-    encodings = (
-        encoding.message_encoding
-        for encoding in channels
-        if encoding.message_encoding != "json" or encoding.topic in OWN_TOPICS
-    )
-    return next(
-        (
-            encoding in ROS_ENCODINGS
-            for encoding in encodings
-            if encoding in {*ROS_ENCODINGS, "json"}
-        ),
-        False,
-    )
+    for record in records_of(path):
+        if not isinstance(record, kinds.Channel):
+            continue
+        if record.message_encoding in ROS_ENCODINGS:
+            return True
+        # JSON of other topics may be anybody's
+        if record.message_encoding == "json" and record.topic in OWN_TOPICS:
+            return False
+    return False
 
 
 def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[Any]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import NoReturn
 
 from hilstar.attitude.wire.apart import RawLink, ReadOrder, Record, pack
-from hilstar.attitude.wire.roads import LinkCounts, RawMessage, read_device
+from hilstar.attitude.wire.roads import LinkCounts, RawMessage, is_readable, read_device
 from hilstar.basics.errors import HilstarError, one_line
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import ENDING, end_with_parent
@@ -78,7 +78,7 @@ class _OpenDevice:
         self._clock = clock
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        return bool(select.select([self._file], [], [], timeout_ms / 1000)[0])
+        return is_readable(self._file, timeout_ms)
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         return read_device(self._file, timeout_ms, self._clock)

@@ -50,6 +50,16 @@ EPOCH_DAY = date(1970, 1, 1).toordinal()
 SECONDS_PER_DAY = 86_400
 SHOWN_CHARACTERS = 60
 ACK = b"Ack\n"
+THIS_MACHINE = AllowedSenders()
+USE = RoadUse(
+    table="[attitude]",
+    where="",
+    lost="lost",
+    lost_line="{endpoint}: 42 closed the connection; waiting for it to come back",
+    back="back",
+    back_line="42 is connected again",
+    second_line="a second connection, from {host}, is closed; 42 has one already",
+)
 
 
 def written(q_icrs_to_body: FloatArray) -> str:
@@ -173,22 +183,11 @@ def _time_ns(text: str) -> int | None:
     return seconds * NS_PER_S + int((match[6] or "").ljust(9, "0"))
 
 
-USE = RoadUse(
-    table="[attitude]",
-    where="",
-    lost="lost",
-    lost_line="{endpoint}: 42 closed the connection; waiting for it to come back",
-    back="back",
-    back_line="42 is connected again",
-    second_line="a second connection, from {host}, is closed; 42 has one already",
-)
-
-
 def tcp_road(
     endpoint: str,
     *,
     bind: bool = False,
-    allowed: AllowedSenders | None = None,
+    allowed: AllowedSenders = THIS_MACHINE,
     notices: Notices | None = None,
     clock: HostClock = HOST_CLOCK,
 ) -> TcpRoad:
@@ -202,14 +201,9 @@ def tcp_road(
             f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001"
         )
     host, _, port = place.address.removeprefix("tcp://").rpartition(":")
-    road = TcpRoad(
-        ("0.0.0.0" if host == "*" else host.strip("[]"), 0 if port == "*" else int(port)),
-        AllowedSenders() if allowed is None else allowed,
-        USE,
-        notices,
-        clock,
-        listening=bind,
-    )
+    host = "0.0.0.0" if host == "*" else host.strip("[]")
+    number = 0 if port == "*" else int(port)
+    road = TcpRoad((host, number), allowed, USE, notices, clock, listening=bind)
     if not bind:
         road.endpoint = endpoint  # as it was written
     return road
@@ -246,7 +240,7 @@ class _Nasa42(MessageLink):
         reader: MessageReader,
         *,
         bind: bool = False,
-        allowed: AllowedSenders | None = None,
+        allowed: AllowedSenders = THIS_MACHINE,
         notices: Notices | None = None,
         clock: HostClock = HOST_CLOCK,
     ) -> None:

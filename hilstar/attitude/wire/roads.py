@@ -216,11 +216,18 @@ class ByteRoad(Closing, ABC):
             self._retry.put_off()
 
 
+def is_readable(file: int, timeout_ms: float) -> bool:
+    """Whether bytes, or an end, wait at an open file, of any number; waits at most `timeout_ms`."""
+    poll = select.poll()
+    poll.register(file, select.POLLIN)
+    return bool(poll.poll(timeout_ms))
+
+
 def read_device(file: int, timeout_ms: int, clock: HostClock = HOST_CLOCK) -> list[RawMessage]:
     """The bytes that wait at an open device; waits at most `timeout_ms` for the first. Raises
     OSError where it no longer answers.
     """
-    if not select.select([file], [], [], timeout_ms / 1000)[0]:
+    if not is_readable(file, timeout_ms):
         return []
     try:
         data = os.read(file, MAX_READ_BYTES)

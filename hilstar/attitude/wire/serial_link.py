@@ -21,7 +21,14 @@ from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, unframed_packet
 from hilstar.attitude.wire.links import Decoder, StreamLink, pieces
-from hilstar.attitude.wire.roads import ATTITUDES, ByteRoad, RawMessage, RoadUse, read_device
+from hilstar.attitude.wire.roads import (
+    ATTITUDES,
+    ByteRoad,
+    RawMessage,
+    RoadUse,
+    is_readable,
+    read_device,
+)
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.basics.errors import HilstarError, InputError, NotThereError, one_line
 from hilstar.basics.notices import Notices
@@ -129,9 +136,7 @@ class SerialRoad(ByteRoad):
         """True once unread bytes wait."""
         device = self._device
         try:
-            return device is not None and bool(
-                select.select([device.fileno()], [], [], timeout_ms / 1000)[0]
-            )
+            return device is not None and is_readable(device.fileno(), timeout_ms)
         except LOST:  # gone: `taken` notices, and reports it
             return False
 

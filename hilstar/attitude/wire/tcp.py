@@ -9,8 +9,8 @@ import select
 import socket
 
 from hilstar.attitude.wire.endpoint import AllowedSenders
+from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
 from hilstar.attitude.wire.roads import ATTITUDES, MAX_READ_BYTES, ByteRoad, RawMessage, RoadUse
-from hilstar.attitude.wire.udp import ANCILLARY_BYTES, KernelStamps
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
@@ -207,4 +207,6 @@ class TcpRoad(ByteRoad):
 
 def _endpoint(place: tuple[str, int]) -> str:
     host, port = place
-    return f"tcp://{f'[{host}]' if ':' in host else host}:{port}"
+    if ":" in host:
+        return f"tcp://[{host}]:{port}"
+    return f"tcp://{host}:{port}"

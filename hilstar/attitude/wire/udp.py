@@ -27,6 +27,7 @@ from functools import partial
 from typing import Any
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
+from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
 from hilstar.attitude.wire.links import Arrival, PacketDecoder, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, encode
 from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, RawMessage, RoadUse
@@ -44,10 +45,6 @@ LOAD_WORD, AND, JUMP_IF_EQUAL, RETURN = 0x20, 0x54, 0x15, 0x06
 WHOLE, NOTHING = 0xFFFF, 0
 INSTRUCTION = struct.Struct("=HBBI")
 MAX_INSTRUCTIONS = 4096
-# Linux's number (asm-generic/socket.h); the stamp is a timespec of CLOCK_REALTIME
-SO_TIMESTAMPNS = 35
-TIMESPEC = struct.Struct("@ll")
-ANCILLARY_BYTES = socket.CMSG_SPACE(TIMESPEC.size)
 # the rest of a longer one is cut off, and `packet.decode` refuses what is left
 MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1
 # the kernel gives what it allows; a small datagram takes some 800 bytes of it
@@ -80,12 +77,12 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
         if network.version != version:
             continue
         address, mask = network.network_address.packed, network.netmask.packed
-        words = range(0, len(address), WORD_BYTES)
+        word_places = range(0, len(address), WORD_BYTES)
         # each word of the source address must be the network's, else go on after this network
-        for k, at in enumerate(words):
+        for k, at in enumerate(word_places):
             address_word = int.from_bytes(address[at : at + WORD_BYTES], "big")
             mask_word = int.from_bytes(mask[at : at + WORD_BYTES], "big")
-            to_next_network = 3 * (len(words) - k - 1) + 1
+            to_next_network = 3 * (len(word_places) - k - 1) + 1
             code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + SOURCE_AT[version] + at))
             code.append(INSTRUCTION.pack(AND, 0, 0, mask_word))
             code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, to_next_network, address_word))
@@ -107,37 +104,6 @@ def keep_only_networks(receiving: socket.socket, networks: Sequence[Network]) ->
         receiving.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, pointer)
         return True
     return False
-
-
-class KernelStamps:
-    """Has the kernel stamp arrivals at `receiving`; where it cannot, the time of reading counts.
-
-    `empty_ns` is when nothing waited last, host time: what is read arrived later than that. Of a
-    TCP stream the stamp is that of the last byte read.
-    """
-
-    def __init__(self, receiving: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
-        self._clock = clock
-        self.empty_ns = clock.now_ns()
-        with contextlib.suppress(OSError):
-            receiving.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-
-    def arrived_ns(
-        self, ancillary: list[tuple[int, int, bytes]], now_ns: int, offset_ns: int | None = None
-    ) -> int:
-        """When something came, from what `recvmsg` told at `now_ns`.
-
-        A realtime clock that was set meanwhile moves it by no more than it waited.
-        `offset_ns` is the clock's `monotonic_minus_realtime_ns()`, where it was asked for already.
-        """
-        for _, kind, stamp in ancillary:
-            if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
-                seconds, ns = TIMESPEC.unpack(stamp)
-                if offset_ns is None:
-                    offset_ns = self._clock.monotonic_minus_realtime_ns()
-                stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
-                return min(max(stamped_ns, self.empty_ns), now_ns)
-        return now_ns
 
 
 class Datagrams:

@@ -67,7 +67,7 @@ class ZmqRoad(ZmqSocket):
         self._lost_until = self._clock.within(0.0)
 
     def opener(self) -> OpenStream:
-        """A function by which another process opens the same socket."""
+        """A function by which another process opens a link on the same socket."""
         more: dict[str, Any] = {
             "keys": self._keys,
             "topic": self._topic,

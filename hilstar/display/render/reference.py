@@ -96,6 +96,14 @@ def _glow(light: GlowLight, region: Rectangle) -> FloatArray:
     return np.asarray(light.peak_e_per_s * profile.reshape(height, width))
 
 
+def _ray_places(first_px: int, size_px: int, margin_px: int) -> FloatArray:
+    """Places along an axis of rays through pixels and a margin on either side, RAYS_ACROSS in
+    each pixel.
+    """
+    rays = np.arange((size_px + 2 * margin_px) * RAYS_ACROSS)
+    return (rays + 0.5) / RAYS_ACROSS - 0.5 - margin_px + first_px
+
+
 def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
     """A disc's light and cover (height, width) in a region: sharp on a grid of rays, then spread
     by the Gaussian.
@@ -104,10 +112,8 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
 
     left, top, width, height = region
     margin = int(np.ceil(REACH_SIGMAS * max(light.psf.width_px)))
-    columns, rows = (
-        (np.arange((size + 2 * margin) * RAYS_ACROSS) + 0.5) / RAYS_ACROSS - 0.5 - margin + first
-        for size, first in ((width, left), (height, top))
-    )
+    columns = _ray_places(left, width, margin)
+    rows = _ray_places(top, height, margin)
     at_once = max(1, RAYS_AT_ONCE // len(columns))
     sharp = np.concatenate(
         [_rays(light, columns, rows[k : k + at_once]) for k in range(0, len(rows), at_once)], axis=1

@@ -24,6 +24,7 @@ from hilstar.basics.pages import (
     details_of,
     drawing_of,
     figures_of,
+    key_table,
     list_of,
     measured,
     page_of,
@@ -171,7 +172,7 @@ def _answers(found: Assessment) -> Card:
     cures = [cure for count, cure in causes if count]
     return Card(
         "Answers over the run",
-        words=[table_of(rows)],
+        words=[key_table(rows)],
         picture=_over_time(found),
         cure=" ".join(cures),
     )
@@ -301,7 +302,9 @@ def _bias(found: Assessment) -> Card:
         measured(bias.axes.cross, half, ARCSEC),
         "constant turn across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
     )
-    return Card("Bias", figure, [table_of(rows), paragraph("95 % intervals in brackets.", "small")])
+    return Card(
+        "Bias", figure, [key_table(rows), paragraph("95 % intervals in brackets.", "small")]
+    )
 
 
 def _pixel(found: Assessment) -> Card:
@@ -370,7 +373,7 @@ def _beside(found: Assessment) -> Card:
         rows.append(("bench", bench_text(found)))
     if found.glass is not None:
         rows.append(("glass", found.glass.line()))
-    return Card("What is not the tracker's", words=[table_of(rows)])
+    return Card("What is not the tracker's", words=[key_table(rows)])
 
 
 def _slices(found: Assessment) -> Iterator[Card]:

@@ -173,7 +173,9 @@ def _dot_sides(data: MatchedDots, x_px: FloatArray, y_px: FloatArray) -> FloatAr
     place = np.stack([data.seen.x_px, data.seen.y_px], axis=1)
     middle = place.mean(axis=0)
     scale = float(np.abs(place - place.mean(axis=0)).max())
-    powers = [(i, j) for i in range(4) for j in range(4 - i) if len(data) > 40 or i + j < 2]
+    # a cubic map has ten terms; few dots determine a linear one
+    degree = 3 if len(data) > 40 else 1
+    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     u, v = ((place - middle) / scale).T
     terms = np.stack([u**i * v**j for i, j in powers], axis=1)
     by_u = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in powers], axis=1) / scale
@@ -385,7 +387,7 @@ def _each_gaussian(dots: Dots) -> tuple[Dots, FloatArray]:
 
 
 def _moved(dots: Dots) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Offsets of pixels from dots that are moved by STEP_PX along x, and along y."""
+    """The offsets of pixels from the dots if these were STEP_PX farther along x, and along y."""
     x, y = dots.offsets
     return (x - STEP_PX, y), (x, y - STEP_PX)
 
@@ -567,26 +569,21 @@ def summary_of(found: Found) -> dict[str, Any]:
 def lines_of(found: Found) -> list[str]:
     """The same as lines of text."""
     x, y = found.sigma_px
+    side_px = 2 * found.half_px + 1
+    sigmas = f"sigma {x:.3f} and {y:.3f} px in the middle of the field, without dot and pixel"
     rows = [
-        ("dots", f"{found.dots}, each within {2 * found.half_px + 1} x {2 * found.half_px + 1} px"),
-        (
-            "Gaussian",
-            f"sigma {x:.3f} and {y:.3f} px in the middle of the field, without dot and pixel",
-        ),
-        *(
-            (
-                m.name,
-                (
-                    f"{m.rms:.2%} of the peak off held-out dots (noise: {m.noise:.2%}), reduced chi"
-                    f" square {m.chi2.mean():.2f}"
-                ),
-            )
-            for m in found.models
-        ),
-        (
-            "chosen",
-            found.chosen.name + ("" if found.asks_for_more else ": the data ask for no more"),
-        ),
+        ("dots", f"{found.dots}, each within {side_px} x {side_px} px"),
+        ("Gaussian", sigmas),
     ]
+    for model in found.models:
+        text = (
+            f"{model.rms:.2%} of the peak off held-out dots (noise: {model.noise:.2%}), reduced chi"
+            f" square {model.chi2.mean():.2f}"
+        )
+        rows.append((model.name, text))
+    chosen = found.chosen.name
+    if not found.asks_for_more:
+        chosen += ": the data ask for no more"
+    rows.append(("chosen", chosen))
     width = max(len(name) for name, _ in rows) + 2
     return [f"{name:{width}}{text}" for name, text in rows]

@@ -77,16 +77,13 @@ def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch
     white = 2**settings.bits - 1
     light = (np.array(codes) / white) ** 2.2
     faint = [code for code, is_faint in zip(codes, light < FAINT_LIGHT, strict=True) if is_faint]
-    drawn = [
-        Patch(code, name)
-        for name in settings.channels
-        for code in [*codes, *faint]
-        for _ in range(settings.repeats)
-    ]
+    drawn: list[Patch] = []
+    references: list[Patch] = []
+    for name in settings.channels:
+        for code in [*codes, *faint]:
+            drawn += [Patch(code, name)] * settings.repeats
+        references += [Patch(code, name) for code in (0, white // 2, white)]
     shuffled = [drawn[place] for place in rng.permutation(len(drawn))]
-    references = [
-        Patch(code, name) for name in settings.channels for code in (0, white // 2, white)
-    ]
     at_once = PATCHES_PER_REFERENCE * len(settings.channels)
     patches: list[Patch] = []
     for start in range(0, len(shuffled), at_once):

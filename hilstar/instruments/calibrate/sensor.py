@@ -107,10 +107,13 @@ class SensorFile:
     @property
     def lines(self) -> list[str]:
         """A line for each key: `key = value`, and `+- sigma` where it was measured."""
-        return [
-            f"{key} = {value:.6g}" + (f" +- {self.sigmas[key]:.2g}" if key in self.sigmas else "")
-            for key, value in self.keys.items()
-        ]
+        lines = []
+        for key, value in self.keys.items():
+            line = f"{key} = {value:.6g}"
+            if key in self.sigmas:
+                line += f" +- {self.sigmas[key]:.2g}"
+            lines.append(line)
+        return lines
 
     @property
     def settings(self) -> DetectorSettings:

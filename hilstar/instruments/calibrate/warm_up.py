@@ -163,18 +163,12 @@ class _Law:
         at = self._figures(self.parameters, span_s, limit)
         # small where an error is: the figures are linear there
         steps = 1e-4 * np.sqrt(np.diag(self.covariance))
-        slopes = np.stack(
-            [
-                (self._figures(self.parameters + step, span_s, limit) - at) / step.sum()
-                for step in np.diag(steps)
-            ]
-        )
-        return (
-            at.tolist(),
-            np.sqrt(
-                np.maximum(np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes), 0.0)
-            ).tolist(),
-        )
+        slopes = np.empty((len(steps), len(at)))
+        for row, step in enumerate(np.diag(steps)):
+            moved = self._figures(self.parameters + step, span_s, limit)
+            slopes[row] = (moved - at) / step.sum()
+        variance = np.einsum("pi,pq,qi->i", slopes, self.covariance, slopes)
+        return at.tolist(), np.sqrt(np.maximum(variance, 0.0)).tolist()
 
     @staticmethod
     def _figures(parameters: FloatArray, span_s: float, limit: float) -> FloatArray:
@@ -236,19 +230,15 @@ def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> 
     for first in (part * len(light) // PARTS for part in range(PARTS)):
         if len(light) - first < MIN_READINGS:
             break
-        laws = sorted(
-            (law for law in _laws(t_s[first:], light[first:]) if not law.is_refused),
-            key=lambda law: law.criterion,
-        )
-        judgements = [
-            _judged(law, t_s[first:], light[first:], limit)
-            for law in laws
-            if law.criterion < laws[0].criterion + LIKELY
-        ]
+        laws = [law for law in _laws(t_s[first:], light[first:]) if not law.is_refused]
+        laws.sort(key=lambda law: law.criterion)
+        judgements = []
+        for law in laws:
+            if law.criterion < laws[0].criterion + LIKELY:
+                judgements.append(_judged(law, t_s[first:], light[first:], limit))
         if judgements:  # white is stable only if it is by each law that is likely
-            return replace(
-                judgements[0], is_stable=all(judgement.is_stable for judgement in judgements)
-            )
+            is_stable = all(judgement.is_stable for judgement in judgements)
+            return replace(judgements[0], is_stable=is_stable)
     return WarmUp("none", False, limit)
 
 

@@ -35,7 +35,7 @@ from hilstar.instruments.campaign.plan import (
     parameters,
 )
 from hilstar.instruments.campaign.store import Row
-from hilstar.instruments.simulate.batch import faulty_exposure, view_at
+from hilstar.instruments.simulate.exposures import faulty_exposure, view_at
 from hilstar.instruments.simulate.simulator import FaultyExposure, Simulator
 from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.layers.fault_kinds import Fault, fault_of

@@ -19,6 +19,7 @@ from hilstar.basics.pages import (
     drawing_of,
     escaped,
     figures_of,
+    key_table,
     list_of,
     measured,
     page_of,
@@ -137,7 +138,7 @@ def _cards(
     known = [row for row in budget if row.value is not None]
     yield Card("Budget", words=[figures_table(known), limit])
     files = [("table", summary["table"]), ("SHA-256", summary["sha256"])]
-    texts = [table_of(files)]
+    texts = [key_table(files)]
     if summary["notes"]:
         texts.append(list_of(summary["notes"]))
     yield Card("Table and notes", words=texts)

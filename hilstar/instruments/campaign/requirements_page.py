@@ -29,6 +29,7 @@ from hilstar.basics.pages import (
     Markup,
     Verdict,
     drawing_of,
+    key_table,
     page_of,
     paragraph,
     table_of,
@@ -65,11 +66,11 @@ CURES = {
 }
 HEADER = (
     "requirement",
-    "confidence",
+    "verdict",
     "measured",
     "bound",
+    "confidence",
     "cases",
-    "verdict",
     "to show it",
     "method",
 )
@@ -130,7 +131,7 @@ def write_requirements(
     if cube is not None:
         about.append(("cube to boresight", cube.line))
     parts = [_verdicts(verdicts).html(), _error_card(figure).html()]
-    parts.append(Card("Campaign", words=[table_of(about)]).html())
+    parts.append(Card("Campaign", words=[key_table(about)]).html())
     names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
     parts.append(Card("Signed", words=[names]).html())
     page = page_of(f"Requirements of {path.name}", _verdict(verdicts), parts)
@@ -158,8 +159,8 @@ def _verdicts(found: list[RequirementVerdict]) -> Card:
         chip = f'<span class="chip" data-state="{STATES[each.verdict]}">{each.verdict}</span>'
         confidence = f"{100 * each.require.confidence:g} %"
         unit = QUANTITY_UNITS[each.require.quantity]
-        figures = (confidence, _figure(each.value, unit), _figure(each.bound, unit), each.cases)
-        rows.append((each.require.words, *figures, Markup(chip), more, each.method))
+        figures = (_figure(each.value, unit), _figure(each.bound, unit), confidence, each.cases)
+        rows.append((each.require.words, Markup(chip), *figures, more, each.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
     return Card("Verdicts", words=texts, cure=CURES[verdict_of(found)])
 

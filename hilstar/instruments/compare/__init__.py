@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.errors import InputError
+from hilstar.basics.errors import InputError, shortened
 from hilstar.instruments.compare.compare_skies import (
     check_skies,
     compare_skies,
@@ -85,6 +85,12 @@ def compare(
     >>> hilstar.compare(frame, frame).same
     True
     """
+    limits = Limits(flux_mag, centroid_px)
+    if not (truth is None or isinstance(truth, (str, Path, np.ndarray))):
+        raise InputError(
+            f"compare: truth {shortened(repr(truth))}; give a Frame's truth, or the CSV that"
+            " `hilstar frame --truth OUT.csv` writes"
+        )
     images = _image(frame), _image(golden)
     same = images[0].ndim == images[1].ndim
     light, golden_light = (image if same else _together(image) for image in images)
@@ -100,7 +106,7 @@ def compare(
         and describes(truth_table, _together(golden_light))
     ):
         truth = truth_table
-    return compare_skies(light, golden_light, Limits(flux_mag, centroid_px), truth, truth_table)
+    return compare_skies(light, golden_light, limits, truth, truth_table)
 
 
 def _together(image: FloatArray) -> FloatArray:

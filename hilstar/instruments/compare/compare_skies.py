@@ -83,20 +83,15 @@ def compare_skies(
     stars = _differences(seeds, fit, moved, limits)
     more = moved.residual - fit.residual
     less = fit.residual - moved.residual
-    for light, table, error in (
-        (less, truth, math.inf),
-        (more, truth if frame_truth is None else frame_truth, -math.inf),
-    ):
+    if frame_truth is None:
+        frame_truth = truth
+    blend_px = star_fit.blend_distance_px(psf)
+    # stars that only the golden image has, then those that only the frame has
+    for light, table, error in ((less, truth, math.inf), (more, frame_truth, -math.inf)):
         places, flux = _unexplained(light, fit, moved)
-        stars += [
-            StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
-            for hip, (x, y), f in zip(
-                star_fit.names_at(places, table, star_fit.blend_distance_px(psf)),
-                places,
-                flux,
-                strict=True,
-            )
-        ]
+        names = star_fit.names_at(places, table, blend_px)
+        for hip, (x, y), star_flux in zip(names, places.tolist(), flux.tolist(), strict=True):
+            stars.append(StarDifference(hip, x, y, star_flux, error, 0.0, 0.0, limits))
     return SkyComparison(
         stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0]))
     )
@@ -189,12 +184,12 @@ def _differences(
         limit_mag,
         limit_px,
     )
-    return [
-        StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, Limits(own_mag, own_px))
-        for hip, (x_px, y_px, flux, mag, dx_px, dy_px, own_mag, own_px) in zip(
-            seeds.hip, np.column_stack(columns).tolist(), strict=True
-        )
-    ]
+    differences: list[StarDifference] = []
+    for hip, row in zip(seeds.hip, np.column_stack(columns).tolist(), strict=True):
+        x_px, y_px, flux, mag, dx_px, dy_px, star_limit_mag, star_limit_px = row
+        star_limits = Limits(star_limit_mag, star_limit_px)
+        differences.append(StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, star_limits))
+    return differences
 
 
 def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[FloatArray, FloatArray]:

@@ -212,18 +212,17 @@ def write_report(directory: Path, comparison: SkyComparison) -> None:
     Raises InputError where one cannot be written.
     """
     odd = {(star.hip, star.x_px, star.y_px) for star in comparison.differing}
-    rows = [
-        (
-            *(star.kind, " ".join(map(str, star.hip)), star.x_px, star.y_px, star.flux_e_per_s),
-            *(star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px),
-            *(
-                star.limits.flux_mag,
-                star.limits.centroid_px,
-                int((star.hip, star.x_px, star.y_px) in odd),
-            ),
+    rows = []
+    for star in comparison.stars:
+        hips = " ".join(map(str, star.hip))
+        differs = int((star.hip, star.x_px, star.y_px) in odd)
+        rows.append(
+            (
+                *(star.kind, hips, star.x_px, star.y_px, star.flux_e_per_s),
+                *(star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px),
+                *(star.limits.flux_mag, star.limits.centroid_px, differs),
+            )
         )
-        for star in comparison.stars
-    ]
     write_csv(directory / "compare.csv", COLUMNS, rows)
     figure = draw(directory / "compare", comparison)
     parts = [figures_of(_figures(comparison))]

@@ -8,6 +8,7 @@ explains stays in the residual. The stars to fit come from a truth table or are 
 near ones are one blend.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -91,11 +92,12 @@ class StarTemplates:
             np.concatenate([np.arange(size), near[:, k], near[:, 1 - k]]) for k in (0, 1)
         )
         along_x, along_y = (profiles.overlaps(star, other) for profiles in (self._x, self._y))
-        entry = [(("share", "slope").index(y), ("share", "slope").index(x)) for y, x in COLUMNS]
-        blocks = np.stack(
-            [along_y[:, ya, yb] * along_x[:, xa, xb] for ya, xa in entry for yb, xb in entry],
-            axis=1,
-        )
+        number_of = {"share": 0, "slope": 1}
+        entries = [(number_of[y], number_of[x]) for y, x in COLUMNS]
+        products = []
+        for (ya, xa), (yb, xb) in itertools.product(entries, entries):
+            products.append(along_y[:, ya, yb] * along_x[:, xa, xb])
+        blocks = np.stack(products, axis=1)
         row = 3 * star[:, None] + np.arange(9) // 3
         col = 3 * other[:, None] + np.arange(9) % 3
         return csc_array((blocks.ravel(), (row.ravel(), col.ravel())), shape=(3 * size, 3 * size))

@@ -1,114 +1,24 @@
 """Frames of the virtual tracker along a log, over all cores."""
 
-import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.logs.log_file import log_timeline
-from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import MachineError
 from hilstar.basics.files import make_directory
 from hilstar.basics.process.pool import ProcessPool
-from hilstar.basics.rotation import rate_between_rad_s
-from hilstar.basics.units import NS_PER_S
+from hilstar.instruments.simulate.exposures import LogFaults
 from hilstar.instruments.simulate.pictures import write_exposure_fits
 from hilstar.instruments.simulate.simulator import (
     ExposurePiece,
     FaultyExposure,
     FrameNoise,
     Simulator,
-    pieces_of,
     simulator_view,
 )
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.scenario import Scenario, Timetable
-
-
-def log_views(
-    samples: list[AttitudeSample],
-    frame_count: int | None,
-    exposure_s: float,
-    max_rate_rad_s: float = math.inf,
-) -> list[View]:
-    """The exposures along a log: in the middle of each its attitude, and the mean rate over the
-    exposure.
-
-    One at each sample, or `frame_count` of them evenly from the first to the last. Within half an
-    exposure of the log's
-    ends the rate is that of the part inside.
-    """
-    timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
-    first_ns = samples[0].t_ns
-    last_ns = samples[-1].t_ns
-    if frame_count is None:
-        times_ns = [sample.t_ns for sample in samples]
-    else:
-        times_ns = [round(t) for t in np.linspace(first_ns, last_ns, frame_count)]
-    return [view_at(timeline, (first_ns, last_ns), t_ns, exposure_s) for t_ns in times_ns]
-
-
-def view_at(timeline: Timeline, span_ns: tuple[int, int], t_ns: int, exposure_s: float) -> View:
-    """The exposure around `t_ns` of a log that lasts over `span_ns` (see `log_views`)."""
-    half_ns = round(exposure_s * NS_PER_S / 2)
-    ends_ns = max(span_ns[0], t_ns - half_ns), min(span_ns[1], t_ns + half_ns)
-    begin, middle, end = (timeline.at(t) for t in (ends_ns[0], t_ns, ends_ns[1]))
-    if begin is None or middle is None or end is None:
-        raise AssertionError("a log has a sample")
-    rate = np.zeros(3)
-    if ends_ns[1] > ends_ns[0]:
-        rate = rate_between_rad_s(
-            begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S
-        )
-    return View.exposure(middle.q_icrs_to_cam, rate, exposure_s, t_ns)
-
-
-@dataclass(frozen=True, slots=True)
-class LogFaults:
-    """A scenario along a log, from whose first sample it counts."""
-
-    scenario: Scenario
-    samples: list[AttitudeSample]
-    max_rate_rad_s: float = math.inf
-
-    def pieces(self, simulator: Simulator, views: list[View]) -> list[tuple[ExposurePiece, ...]]:
-        """Each exposure, cut where a fault begins or ends. Raises InputError for a fault that
-        cannot be drawn.
-        """
-        timetable = Timetable(
-            self.scenario,
-            simulator_view(simulator, self.scenario).prepare,
-            simulator.config.tracker.exposure_s,
-        )
-        timeline = log_timeline(self.samples, Policy(0, NS_PER_S, self.max_rate_rad_s))
-        zero_ns = self.samples[0].t_ns
-
-        def attitude_at(run_ns: int) -> FloatArray:
-            state = timeline.at(zero_ns + run_ns)
-            if state is None:
-                raise AssertionError("a log has a sample")
-            return state.q_icrs_to_cam
-
-        return [
-            pieces_of(view, (view.t_ns or 0) - zero_ns, timetable, attitude_at) for view in views
-        ]
-
-
-def faulty_exposure(
-    simulator: Simulator, view: View, scenario: Scenario, run_ns: int
-) -> FaultyExposure:
-    """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError
-    (see `FaultView.prepare`).
-    """
-    seen_by = simulator_view(simulator, scenario)
-    timetable = Timetable(scenario, seen_by.prepare, simulator.config.tracker.exposure_s)
-    return FaultyExposure(seen_by, pieces_of(view, run_ns, timetable))
+from hilstar.server.bench.scenario import Scenario
 
 
 def simulate_views(

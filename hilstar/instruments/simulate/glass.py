@@ -25,13 +25,10 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
 
     def of(x: FloatArray, y: FloatArray) -> FloatArray:
         if not psf.by_colour:
-            offsets = near - x[:, None], near - y[:, None]
-            return np.stack(
-                [
-                    psf.shares(across[None, :], down[:, None])
-                    for across, down in zip(*offsets, strict=True)
-                ]
-            )
+            stamps = []
+            for across, down in zip(near - x[:, None], near - y[:, None], strict=True):
+                stamps.append(psf.shares(across[None, :], down[:, None]))
+            return np.stack(stamps)
         places = columns + x, rows + y
         light = psf.stamps_at(*places, psf.mean_shares if shares is None else shares)
         own_size = light.shape[1]

@@ -226,8 +226,8 @@ class LiveTracker(Closing):
             levels.reshape(len(levels), math.prod(levels.shape[1:])).T,
         )
         lights = [
-            one.response.light[k] * one.flux_at_white_e_per_s
-            for one, k in zip(panels, columns, strict=True)
+            panel.response.light[k] * panel.flux_at_white_e_per_s
+            for panel, k in zip(panels, columns, strict=True)
         ]
         light = np.stack(lights, axis=1)
         if self._panel.uniformity is not None:
@@ -363,15 +363,14 @@ class LiveTracker(Closing):
             hip = {}
         else:
             hip = dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
-        return tuple(
-            ReportedStar(
-                float(stars.x_px[k]),
-                float(stars.y_px[k]),
-                float(stars.flux_e[k]) / gain,
-                hip.get(k) or None,
+        reported: list[ReportedStar] = []
+        for k in range(min(len(stars), MAX_REPORTED)):
+            dn = float(stars.flux_e[k]) / gain
+            star = ReportedStar(
+                float(stars.x_px[k]), float(stars.y_px[k]), dn, hip=hip.get(k) or None
             )
-            for k in range(min(len(stars), MAX_REPORTED))
-        )
+            reported.append(star)
+        return tuple(reported)
 
     def _near(self, q_icrs_to_cam: FloatArray) -> tuple[IntArray, FloatArray]:
         near = self.stars.near(to_matrix(q_icrs_to_cam)[2], self._radius_rad)

@@ -125,24 +125,17 @@ class NoisyStar:
         y_px, x_px = (grid.ravel() for grid in np.meshgrid(phase, phase))
         step = SLOPE_STEP_PX
         star_pattern, sky = self._patterns()
-        by_x, by_y = (
-            (self.stamps(x_px + dx, y_px + dy) - self.stamps(x_px - dx, y_px - dy)) / (2 * step)
-            for dx, dy in ((step, 0.0), (0.0, step))
-        )
-        even = np.ones_like(by_x)
+        stamps = self.stamps(x_px, y_px)
+        slope_x = (self.stamps(x_px + step, y_px) - self.stamps(x_px - step, y_px)) / (2 * step)
+        slope_y = (self.stamps(x_px, y_px + step) - self.stamps(x_px, y_px - step)) / (2 * step)
         count = phases**2 * len(star_pattern)
-        self.shares, *slopes = (
-            (pattern[:, None] * stamp).reshape(count, -1)
-            for pattern, stamp in (
-                (star_pattern, self.stamps(x_px, y_px)),
-                (star_pattern, by_x),
-                (star_pattern, by_y),
-                (sky, even),
-            )
-        )
-        self._sky = slopes[2] if mosaic is not None else np.ones((1, 1))
+        self.shares = (star_pattern[:, None] * stamps).reshape(count, -1)
+        by_x = (star_pattern[:, None] * slope_x).reshape(count, -1)
+        by_y = (star_pattern[:, None] * slope_y).reshape(count, -1)
+        by_sky = (sky[:, None] * np.ones_like(stamps)).reshape(count, -1)
+        self._sky = by_sky if mosaic is not None else np.ones((1, 1))
         # by x, y, flux, background; of one electron
-        by = np.stack([*slopes[:2], self.shares, slopes[2]])
+        by = np.stack([by_x, by_y, self.shares, by_sky])
         self._pairs = np.einsum("ifp,jfp->fpij", by, by).reshape(count, -1, 16)
 
     def _patterns(self) -> FloatArray:
@@ -156,6 +149,10 @@ class NoisyStar:
         return np.stack(
             [whole[:, y : y + side, x : x + side] for y in (0, 1) for x in (0, 1)], axis=1
         )
+
+    def _windows(self, values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+        """Values of pixels, broadcast to (n, phases, pixels), as windows (m, side, side)."""
+        return np.broadcast_to(values, shape).reshape(-1, self.side_px, self.side_px)
 
     def stamps(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Shares (n, side, side) of stars so far (n,) from the middle of their square."""
@@ -267,15 +264,10 @@ class NoisyStar:
         """
         noise, sky = noises
         if self.detector.takes_superpixels:
-            light, variance, dark = (
-                superpixels(
-                    np.broadcast_to(one, noise.total_e2.shape).reshape(
-                        -1, self.side_px, self.side_px
-                    ),
-                    squared=k > 0,
-                )
-                for k, one in enumerate((star_e * self.shares, noise.total_e2, sky.total_e2))
-            )
+            shape = noise.total_e2.shape
+            light = superpixels(self._windows(star_e * self.shares, shape))
+            variance = superpixels(self._windows(noise.total_e2, shape), squared=True)
+            dark = superpixels(self._windows(sky.total_e2, shape), squared=True)
             limit_e = finder.threshold_sigma * np.sqrt(dark.mean(axis=(1, 2), keepdims=True))
             above = np.pad(ndtr((light - limit_e) / np.sqrt(variance)), ((0, 0), (0, 1), (0, 1)))
             by_place = np.stack(
@@ -656,10 +648,10 @@ def _nea_rows(
     rows = []
     for limit in [*limits.tolist(), faintest_v_mag]:
         counts = [int(np.searchsorted(field["v_mag"], limit, side="right")) for field in sights]
-        median = np.median(
-            [curve[..., n - 1] if n else none for curve, n in zip(curves, counts, strict=True)],
-            axis=0,
-        )
+        at_limit = []
+        for curve, count in zip(curves, counts, strict=True):
+            at_limit.append(curve[..., count - 1] if count else none)
+        median = np.median(at_limit, axis=0)
         row = {"v_mag": limit, "stars": float(np.median(counts))}
         rows.append(row | dict(zip(NEA_COLUMNS, median.ravel().tolist(), strict=True)))
     is_limited = [math.isfinite(row["limit_about_arcsec"]) for row in rows]
@@ -672,17 +664,17 @@ def write_noise(directory: Path, found: NoiseBudget) -> None:
     """
     for name, rows in (("noise", found.rows), ("nea", found.nea), ("stars", found.stars)):
         if rows:
-            texts = []
-            for row in rows:
-                texts.append(
-                    [
-                        "" if isinstance(v, float) and not math.isfinite(v) else v
-                        for v in row.values()
-                    ]
-                )
-            write_csv(directory / f"{name}.csv", list(rows[0]), texts)
+            cells = [list(map(_cell, row.values())) for row in rows]
+            write_csv(directory / f"{name}.csv", list(rows[0]), cells)
     if math.isfinite(found.nea_arcsec["limit"]["about"]):
         _draw(directory / "nea", found)
+
+
+def _cell(value: object) -> object:
+    """A value of a table, "" for a number that is not finite."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return ""
+    return value
 
 
 def _draw(path: Path, found: NoiseBudget) -> None:

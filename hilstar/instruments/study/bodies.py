@@ -189,10 +189,12 @@ def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
     """
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
-    disc = next(
-        d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, t_ns) if d.name == body
-    )
-    off_rad = np.radians(off_deg) + (disc.radius_rad if body == "Earth" else 0.0)
+    whole_sky = np.array([0.0, 0.0, 1.0]), np.pi
+    discs = bench.moving.discs(*whole_sky, 0.0, t_ns)
+    disc = next(disc for disc in discs if disc.name == body)
+    off_rad = np.radians(off_deg)
+    if body == "Earth":
+        off_rad += disc.radius_rad
     # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
     if body == "Earth":
         beside = disc.sun
@@ -483,21 +485,21 @@ def run(directory: Path, quick: bool = False) -> Judged:
     """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each
     finding. Raises InputError.
     """
-    others, rounds = OtherWork(), QUICK_ROUNDS if quick else ROUNDS
-    scenes = [scene for scene in SCENES if scene.bench in QUICK_BENCHES] if quick else SCENES
-    with opened(QUICK_BENCHES if quick else tuple(BODIES)) as benches:
-        costs = [measure_cost(benches, scene, rounds) for scene in scenes]
-        nears = [
-            approach(benches, body, off_deg, max(QUICK_ROUNDS, rounds // 4))
-            for body, angles in (QUICK_DEG if quick else NEAR_DEG).items()
-            for off_deg in angles
-        ]
+    others = OtherWork()
+    names: tuple[str, ...] = QUICK_BENCHES if quick else tuple(BODIES)
+    rounds = QUICK_ROUNDS if quick else ROUNDS
+    near_deg = QUICK_DEG if quick else NEAR_DEG
+    radii_px: tuple[float, ...] = QUICK_RADII_PX if quick else RADII_PX
+    with opened(names) as benches:
+        costs = [measure_cost(benches, scene, rounds) for scene in SCENES if scene.bench in names]
+        nears = []
+        for body, angles_deg in near_deg.items():
+            for off_deg in angles_deg:
+                nears.append(approach(benches, body, off_deg, max(QUICK_ROUNDS, rounds // 4)))
     load = others.load()
-    sizes = [
-        exactness(radius, phase)
-        for phase in PHASES_DEG
-        for radius in (QUICK_RADII_PX if quick else RADII_PX)
-    ]
+    sizes = []
+    for phase_deg in PHASES_DEG:
+        sizes += [exactness(radius_px, phase_deg) for radius_px in radii_px]
     for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
         write_records(directory / f"{name}.csv", records)
     cost_line = draw_costs(directory / "bodies_cost", costs, load)

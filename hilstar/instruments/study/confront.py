@@ -73,20 +73,14 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographF
         try:
             fitted = confront(folder / "guess.toml", paths, output)
         except InputError as error:
-            wrong = next(
-                (
-                    path
-                    for path in paths
-                    if str(path) in str(error) or str(error).startswith(path.name)
-                ),
-                None,
-            )
-            why = re.sub(r"\S*/", "", str(error)).split(": ", 1)[-1]
-            refused += [
-                PhotographFound(folder.name, image_path.name, refused=why)
-                for image_path in ([wrong] if wrong else paths)
-            ]
-            paths = [path for path in paths if wrong is not None and path != wrong]
+            # the image that the message names, or all of them
+            text = str(error)
+            named = [path for path in paths if str(path) in text or text.startswith(path.name)]
+            wrong = named[:1] or paths
+            why = re.sub(r"\S*/", "", text).split(": ", 1)[-1]
+            for path in wrong:
+                refused.append(PhotographFound(folder.name, path.name, refused=why))
+            paths = [path for path in paths if path not in wrong]
     if fitted is None:
         return refused
     rows = [row_of(folder.name, fitted, number) for number in range(len(fitted.verdicts))]
@@ -148,15 +142,15 @@ def line_of(row: PhotographFound) -> str:
 
 def short_name(row: PhotographFound, rows: Sequence[PhotographFound]) -> str:
     """The words of an image's name that not all images of its camera share, whole."""
-    words = Path(row.image).stem.split("_")
+    parts = Path(row.image).stem.split("_")
     others = []
     for other in rows:
         if other.camera == row.camera and other.image != row.image:
             others.append(set(Path(other.image).stem.split("_")))
     if not others:
-        return " ".join(words)
+        return " ".join(parts)
     shared = set.intersection(*others)
-    return " ".join(word for word in words if word not in shared)
+    return " ".join(word for word in parts if word not in shared)
 
 
 def draw(path: Path, found: Sequence[PhotographFound]) -> None:

@@ -91,22 +91,21 @@ def observed_dots(
     """
     width, height = resolution_px
     inside = (x_px > 0) & (x_px < width - 1) & (y_px > 0) & (y_px < height - 1)
-    found: list[FloatArray] = []
+
+    def measured(places: FloatArray, false_count: int, size: int) -> FloatArray:
+        """Places along an axis with their noise, and false ones anywhere."""
+        noisy = places + rng.normal(0, faults.noise_px, len(places))
+        return np.concatenate([noisy, rng.uniform(0, size, false_count)])
+
+    centroids: list[FloatArray] = []
     for frame in range(plan.frames):
         dots = np.flatnonzero(plan.lit[:, frame] & inside)
         dots = dots[rng.uniform(size=len(dots)) >= faults.lost]
-        false = rng.poisson(faults.false * len(dots))
-        x, y = (
-            np.concatenate(
-                [
-                    places[dots] + rng.normal(0, faults.noise_px, len(dots)),
-                    rng.uniform(0, size, false),
-                ]
-            )
-            for places, size in ((x_px, width), (y_px, height))
-        )
-        found.append(np.stack([np.full(len(x), float(frame)), x, y]))
-    frames, x, y = np.concatenate(found, axis=1)
+        false_count = int(rng.poisson(faults.false * len(dots)))
+        x = measured(x_px[dots], false_count, width)
+        y = measured(y_px[dots], false_count, height)
+        centroids.append(np.stack([np.full(len(x), float(frame)), x, y]))
+    frames, x, y = np.concatenate(centroids, axis=1)
     frame_of = frames.astype(np.intp)
     return Observed(frame_of, np.zeros_like(frame_of), x, y, np.ones(len(frame_of)))
 

@@ -375,19 +375,11 @@ def every_limit(quick: bool) -> list[Limit]:
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `limits.csv` and its chart; a line for each limit. Raises InputError."""
     limits = every_limit(quick)
-    rows = [
-        (
-            limit.method,
-            limit.stress,
-            float(at),
-            float(error),
-            limit.unit,
-            limit.tolerance,
-            limit.meets,
-        )
-        for limit in limits
-        for at, error in zip(limit.at, limit.error, strict=True)
-    ]
+    rows = []
+    for limit in limits:
+        ends = limit.unit, limit.tolerance, limit.meets
+        for at, error in zip(limit.at.tolist(), limit.error.tolist(), strict=True):
+            rows.append((limit.method, limit.stress, at, error, *ends))
     write_csv(
         directory / "limits.csv",
         ("method", "stress", "at", "error", "unit", "tolerance", "meets"),

@@ -148,11 +148,10 @@ def catalogue_errors(directory: Path) -> ChartFinding:
     facts = facts_of(catalog.hip)
     bright = catalog.v_mag < TABLE_2_3_V_MAG
     origins = [Counter(facts[name].tolist()) for name in ("v_source", "bv_source")]
-    rows: list[tuple[str, str, float, float]] = [
-        (f"{what} from {source}", "stars", count[source.encode()], printed)
-        for source, both in TABLE_2_2.items()
-        for what, count, printed in zip(("V", "B-V"), origins, both, strict=True)
-    ]
+    rows: list[tuple[str, str, float, float]] = []
+    for source, both in TABLE_2_2.items():
+        for what, count, stars in zip(("V", "B-V"), origins, both, strict=True):
+            rows.append((f"{what} from {source}", "stars", count[source.encode()], stars))
     for name, (unit, printed) in TABLE_2_3.items():
         if name == "sigma_bv_mag":
             here = facts[name].mean()
@@ -331,13 +330,11 @@ def curves(directory: Path) -> ChartFinding:
     """Figures 5.1, 5.2, 5.20 and 5.21: sensors, glass, and the black bodies that they see."""
     names = ("ccd47-20", "kai-4021", "n-bk7-10mm")
     loaded = {name: load_curve(name, name) for name in names}
-    labels = {
-        name: (
-            f"{c.wavelength_nm[0]:.0f} to {c.wavelength_nm[-1]:.0f} nm, most at"
-            f" {c.wavelength_nm[c.value.argmax()]:.0f}"
-        )
-        for name, c in loaded.items()
-    }
+    labels = {}
+    for name, curve in loaded.items():
+        first_nm, last_nm = curve.wavelength_nm[[0, -1]]
+        peak_nm = curve.wavelength_nm[curve.value.argmax()]
+        labels[name] = f"{first_nm:.0f} to {last_nm:.0f} nm, most at {peak_nm:.0f}"
     text = f"The CCD47-20 sees {labels['ccd47-20']}; the approximate KAI-4021 {labels['kai-4021']}"
     note = (
         "CCD47-20: ULTRACAM's red arm, not the thesis's midband coating. KAI-4021: recalled, not"
@@ -556,11 +553,10 @@ def zero_points(directory: Path) -> ChartFinding:
         for axes in (upper, lower):
             axes.grid(visible=False, axis="x")
             axes.legend(loc="upper left", ncols=2)
-    rows = [
-        (sensor, p.zero_point, p.weighting, float(rate), float(m))
-        for sensor in SENSORS
-        for p, rate, m in zip(SETTINGS, rates[sensor], mag[sensor], strict=True)
-    ]
+    rows = []
+    for sensor in SENSORS:
+        for p, rate, cost_mag in zip(SETTINGS, rates[sensor], mag[sensor], strict=True):
+            rows.append((sensor, p.zero_point, p.weighting, float(rate), float(cost_mag)))
     columns = ("sensor", "zero_point", "weighting", "electrons_per_s", "mag_against_default")
     write_csv(directory / "zero_points.csv", columns, rows)
     return ChartFinding("zero_points", text)

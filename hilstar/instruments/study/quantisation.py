@@ -50,16 +50,14 @@ MARKERS = dict(zip(codes.BITS, "os^", strict=True))
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
-    errors_by_way: Found = {
-        (bits, way.name): codes.code_errors(bits, way, phases, mags)
-        for bits in codes.BITS
-        for way in codes.WAYS
-    }
-    rows = [
-        (bits, name, float(mag), *codes.error_cells(e))
-        for (bits, name), errors in errors_by_way.items()
-        for mag, e in zip(mags, errors, strict=True)
-    ]
+    errors_by_way: Found = {}
+    rows = []
+    for bits in codes.BITS:
+        for way in codes.WAYS:
+            errors = codes.code_errors(bits, way, phases, mags)
+            errors_by_way[bits, way.name] = errors
+            for mag, of_mag in zip(mags.tolist(), errors, strict=True):
+                rows.append((bits, way.name, mag, *codes.error_cells(of_mag)))
     write_csv(
         directory / "quantisation.csv",
         ("bits", "method", "mag_under_white", *codes.ERROR_COLUMNS),
@@ -75,21 +73,22 @@ def run(directory: Path, quick: bool = False) -> Judged:
     _draw_magnitudes(directory / "quantisation", errors_by_way, mags)
     draw_each(directory / "quantisation_centroiders", centroider_errors(faintest))
     _draw_times(directory / "quantisation_time", faintest, times, load)
+    time_rows = []
+    for key, of_faintest in faintest.items():
+        mag_under_white = codes.AIMS[key[0]][1]
+        time_rows.append((*key, times[key], mag_under_white, *codes.error_cells(of_faintest)))
     write_csv(
         directory / "quantisation_time.csv",
         ("bits", "method", "frame_ms", "mag_under_white", *codes.ERROR_COLUMNS),
-        [
-            (*key, times[key], codes.AIMS[key[0]][1], *codes.error_cells(e))
-            for key, e in faintest.items()
-        ],
+        time_rows,
     )
     coarsest = codes.BITS[0]
-    rounded, exact = (faintest[coarsest, name] for name in ("round", "exact"))
-    ratios_text = ", ".join(
-        f"{kind} {exact.axis_rms_px(kind) / rounded.axis_rms_px(kind):.2f}"
-        f" ({exact.axis_rms_px(kind):.4f} px)"
-        for kind in FAMILY
-    )
+    ratios = []
+    for kind in FAMILY:
+        rounded_px = faintest[coarsest, "round"].axis_rms_px(kind)
+        exact_px = faintest[coarsest, "exact"].axis_rms_px(kind)
+        ratios.append(f"{kind} {exact_px / rounded_px:.2f} ({exact_px:.4f} px)")
+    ratios_text = ", ".join(ratios)
     ms = ", ".join(f"{way.method} {times[10, way.name]:.1f} ms" for way in codes.WAYS[:4])
     lines = [
         *(_summary(bits, errors_by_way, mags) for bits in codes.BITS),
@@ -269,14 +268,12 @@ def _draw_times(
         ):
             axes.set_ylabel(what)
             axes.margins(0.1)
-            places = {
-                way: (
-                    times[codes.BITS[0], way.name],
-                    _rms(faintest[codes.BITS[0], way.name])[number],
-                )
-                for way in codes.WAYS
-            }
-            name_at_side(axes, [(way.name, place, way.colour) for way, place in places.items()])
+            names = []
+            for way in codes.WAYS:
+                key = codes.BITS[0], way.name
+                place = times[key], _rms(faintest[key])[number]
+                names.append((way.name, place, way.colour))
+            name_at_side(axes, names)
         panels[-1].set_xlabel("time of a frame [ms]")
 
 

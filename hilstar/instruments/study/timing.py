@@ -621,11 +621,10 @@ def measure(quick: bool = False) -> list[TimingOutcome]:
         for k, way in enumerate(WAYS):
             panels.append(stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml")))
         sky = stack.enter_context(TimingSky(panels[0]))
-        return [
-            compare(panel, sky, slew(rate))
-            for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S)
-            for panel in panels
-        ]
+        outcomes: list[TimingOutcome] = []
+        for rate_deg_s in QUICK_RATES_DEG_S if quick else RATES_DEG_S:
+            outcomes += [compare(panel, sky, slew(rate_deg_s)) for panel in panels]
+        return outcomes
 
 
 def run(directory: Path, quick: bool = False) -> Judged:

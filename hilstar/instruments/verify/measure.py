@@ -318,12 +318,9 @@ def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
     x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
     to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)
     fainter = [abs(magnitude(float(star_light))) for star_light in light if star_light > 0]
-    return GlassEffect(
-        *(
-            float(np.percentile(part, 95))
-            for part in (np.hypot(to_x - x, to_y - y), fainter or [0.0])
-        )
-    )
+    px = float(np.percentile(np.hypot(to_x - x, to_y - y), 95))
+    mag = float(np.percentile(fainter or [0.0], 95))
+    return GlassEffect(px, mag)
 
 
 def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
@@ -541,7 +538,9 @@ class Comparison:
     def _measure_noisy(
         self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]
     ) -> None:
-        """The same stars in a noisy exposure (h, w), DN: what the tracker itself adds."""
+        """Measure the same stars in a noisy exposure (h, w), DN: their errors are those of the
+        tracker itself.
+        """
         under = estimate_background(dn, 1.0)
         # rounding's: most of the image may be clipped at 0 DN, beside a glow
         if under.noise <= 1 / math.sqrt(12):

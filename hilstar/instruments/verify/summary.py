@@ -175,32 +175,31 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     error_text = ", ".join(
         f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items()
     )
-    return [
+    lines = [
         f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}",
         f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)",
         f"{'centroid error':20}{centroid}, by {summary['centroider']}",
         f"{'by each centroider':20}{error_text} px rms",
-        *(f"{key:21}{three(errors)} mag" for key, errors in summary["channels_mag"].items()),
-        *(
-            [f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these"]
-            if summary["channels_mag"]
-            else []
-        ),
-        (
-            f"{'with detector noise':20}{three(noisy['flux_mag'])} mag,"
-            f" {three(noisy['centroid_px'])} px"
-        ),
-        *(
-            f"{'V {v_from} to {v_to}'.format(**row):>17}   {row['flux_error_mag'].rms:.4f} mag rms,"
-            f" {row['centroid_error_px'].rms:.4f} px rms, {row['stars']} stars"
-            for row in summary["by_magnitude"]
-        ),
-        *(f"{'':20}{line}" for line in summary["drawn_as_discs"]),
-        f"{'star':20}{_star_line(summary['star'])}",
-        *fault_lines(summary["faults"]),
-        *(f"{'':20}{reason}" for reason in summary["reasons"]),
-        f"{'verdict':20}{'passed' if summary['passed'] else 'NOT passed'}",
     ]
+    for key, errors in summary["channels_mag"].items():
+        lines.append(f"{key:21}{three(errors)} mag")
+    if summary["channels_mag"]:
+        lines.append(f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these")
+    noisy_text = f"{three(noisy['flux_mag'])} mag, {three(noisy['centroid_px'])} px"
+    lines.append(f"{'with detector noise':20}{noisy_text}")
+    for row in summary["by_magnitude"]:
+        span = f"V {row['v_from']} to {row['v_to']}"
+        lines.append(
+            f"{span:>17}   {row['flux_error_mag'].rms:.4f} mag rms,"
+            f" {row['centroid_error_px'].rms:.4f} px rms, {row['stars']} stars"
+        )
+    lines += [f"{'':20}{line}" for line in summary["drawn_as_discs"]]
+    lines.append(f"{'star':20}{_star_line(summary['star'])}")
+    lines += fault_lines(summary["faults"])
+    lines += [f"{'':20}{reason}" for reason in summary["reasons"]]
+    verdict = "passed" if summary["passed"] else "NOT passed"
+    lines.append(f"{'verdict':20}{verdict}")
+    return lines
 
 
 def _star_line(star: dict[str, Any]) -> str:

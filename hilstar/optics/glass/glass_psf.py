@@ -112,9 +112,11 @@ class Field:
     def _holds(self, degree: int) -> bool:
         """Whether the points determine a polynomial of that degree with some to spare."""
         x, y = self._scaled(self.places_px).T
-        terms = np.stack(
-            [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
-        )
+        products = []
+        for i in range(degree + 1):
+            for j in range(degree + 1 - i):
+                products.append(x**i * y**j)
+        terms = np.stack(products, axis=1)
         if degree > 1:
             enough = terms.shape[1] * 1.4 <= len(x)
         else:
@@ -483,15 +485,11 @@ class GlassPsf(SampledPsf):
             stamps, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True
         ):
             image = np.tensordot(weights.astype(np.float64), self.optics.basis, axes=1)
-            down, across = (
-                _pixels_of(
-                    size,
-                    self.per_px,
-                    at_px - (place - np.floor(place + 0.5)),
-                    self.pixel_integrated,
-                )
-                for size, place in zip(image.shape, (y, x), strict=True)
-            )
+            height, width = image.shape
+            down_px = at_px - (y - np.floor(y + 0.5))
+            across_px = at_px - (x - np.floor(x + 0.5))
+            down = _pixels_of(height, self.per_px, down_px, self.pixel_integrated)
+            across = _pixels_of(width, self.per_px, across_px, self.pixel_integrated)
             stamp[:] = down @ image @ across.T
         return stamps
 

@@ -284,7 +284,9 @@ class _LensRays:
         return tangents, places.T
 
     def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
-        """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
+        """The fields (n, 2), relative to the largest, whose stars a camera images at places (n, 2),
+        mm.
+        """
         if self.max_field == 0:
             return np.zeros_like(places_mm)
         tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
@@ -518,10 +520,9 @@ def _counted(
     """Rays shared out among the four samples nearest to each."""
     lit = rays.light > 0
     light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
-    x, y = (
-        (place[lit] + cosine / cos_z * defocus_mm - centre_px) / step_mm + side // 2
-        for place, cosine, centre_px in ((rays.x, cos_x, centre[0]), (rays.y, cos_y, centre[1]))
-    )
+    x_mm = rays.x[lit] + cos_x / cos_z * defocus_mm - centre[0]
+    y_mm = rays.y[lit] + cos_y / cos_z * defocus_mm - centre[1]
+    x, y = x_mm / step_mm + side // 2, y_mm / step_mm + side // 2
     column = np.floor(x).astype(np.intp)
     row = np.floor(y).astype(np.intp)
     image = np.zeros((side, side))
@@ -539,8 +540,8 @@ def _counted(
 
 @dataclass(frozen=True, slots=True)
 class _Chiefs:
-    """The camera that the chief rays at the primary wavelength have: focal length, mm, and
-    Brown-Conrady relative to it.
+    """The camera of the chief rays at the primary wavelength: its focal length, mm, and
+    Brown-Conrady distortion of tangents.
     """
 
     focal_length_mm: float

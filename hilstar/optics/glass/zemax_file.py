@@ -429,7 +429,8 @@ class _Reader(LensFileReader):
                 f"at surface {surface.number} is {shortened(surface.kind)}",
                 f"write one of {known} or COORDBRK",
             )
-        if any(_numbers_of(word for line in surface.extra for word in line.words[1:2])):
+        coefficients = [word for line in surface.extra for word in line.words[1:2]]
+        if any(_numbers_of(coefficients)):
             more = f"at surface {surface.number} gives further coefficients"
             surface.extra[0].refuse(more, ADVICE)
         return LensSurface(

@@ -68,18 +68,21 @@ class BodyLayer:
             posed = self._turning(view, 1 if large else MAX_POSES)
         else:
             posed = self._still(view.icrs_to_image(self.canvas.camera))
-        lights = self._lights(discs, posed)
-        names = [disc.name for disc in reversed(discs)]
         white_e_per_s = self.canvas.white_in(view)
+        extended = list(light.extended)
+        names = []
+        over_white = []
+        for disc, lights in zip(reversed(discs), self._lights(discs, posed), strict=True):
+            extended.extend(lights)
+            if lights:
+                names.append(disc.name)
+            if self._clips(lights, white_e_per_s):
+                over_white.append(disc.name)
         return replace(
             self.unhidden(light, stars, discs, view),
-            extended=(*light.extended, *itertools.chain.from_iterable(lights)),
-            discs=tuple(name for name, its in zip(names, lights, strict=True) if its),
-            over_white=tuple(
-                name
-                for name, its in zip(names, lights, strict=True)
-                if self._clips(its, white_e_per_s)
-            ),
+            extended=tuple(extended),
+            discs=tuple(names),
+            over_white=tuple(over_white),
         )
 
     def on_image(self, view: View) -> list[Disc]:

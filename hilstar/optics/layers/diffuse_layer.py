@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray
+from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.optics.camera import linear_shares
 from hilstar.optics.extended import LightMap
@@ -141,14 +141,10 @@ class DiffuseLayer:
         `own`.
         """
         first = [part.start + whole.start for part, whole in zip(box, around, strict=True)]
-        rows, columns = (
-            np.ceil(
-                np.arange(at, at + part.stop - part.start + 1) * size / (count - 1) - 0.5
-            ).astype(int)
-            for at, part, size, count in zip(
-                first, box, self._camera.resolution_px[::-1], self._counts[::-1], strict=True
-            )
-        )
+        across, down = self._counts
+        width, height = self._camera.resolution_px
+        rows = _first_pixels(first[0], box[0].stop - box[0].start, height, down)
+        columns = _first_pixels(first[1], box[1].stop - box[1].start, width, across)
         return _Part(
             (int(columns[0]), int(rows[0])),
             tuple(slice(part.start, part.stop + 1) for part in box),
@@ -158,6 +154,12 @@ class DiffuseLayer:
             ),
             np.repeat(np.repeat(own, np.diff(rows), axis=0), np.diff(columns), axis=1),
         )
+
+
+def _first_pixels(first_cell: int, cells: int, size_px: int, corners: int) -> IntArray:
+    """The first pixel of each of `cells` cells along an axis, and that behind the last one."""
+    corner = np.arange(first_cell, first_cell + cells + 1)
+    return np.ceil(corner * size_px / (corners - 1) - 0.5).astype(np.intp)
 
 
 @dataclass(slots=True)

@@ -6,6 +6,7 @@ frame that suits: `icrs` or `radec_deg` on the sky, `tracker_px` on the tracker'
 `screen_px` on the monitor.
 """
 
+import itertools
 import math
 import re
 from dataclasses import dataclass
@@ -92,9 +93,8 @@ class PlacedFault(Fault, frozen=True, kw_only=True):
                 " vector x, y, z"
             )
         if any(self.rate_px_s) and self.tracker_px is None and self.screen_px is None:
-            given = next(
-                name for names in self.ONE_OF for name in names if getattr(self, name) is not None
-            )
+            places = itertools.chain(*self.ONE_OF)
+            given = next(name for name in places if getattr(self, name) is not None)
             raise InputError(
                 f"rate_px_s moves a tracker_px or a screen_px, not {given}; leave one of them out"
             )

@@ -51,12 +51,16 @@ class FaultLayer:
 
     def drops(self, frame: int) -> bool:
         """Whether frame number `frame` is never shown."""
-        return any(
-            active.fault.share == 1
-            or self.view.rng(active.fault.name, FRAME_SEED, frame).random() < active.fault.share
-            for active in self.now
-            if isinstance(active.fault, Drop)
-        )
+        for active in self.now:
+            fault = active.fault
+            if not isinstance(fault, Drop):
+                continue
+            if fault.share == 1:
+                return True
+            # by the frame's own number, so that a frame is dropped or not whoever asks
+            if self.view.rng(fault.name, FRAME_SEED, frame).random() < fault.share:
+                return True
+        return False
 
     def turned(self, view: View) -> View:
         """The view that is shown in place of another: its attitude, and its rate in the axes of

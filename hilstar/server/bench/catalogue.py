@@ -120,13 +120,11 @@ def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> dict[s
     )
     place = "pos.eq.ra;meta.main"
     speed = "pos.pm;pos.eq.ra"
+    names = ["" if hip else stars.name(k) for k, hip in enumerate(stars.hip.tolist())]
     return {
         "hip": Column(stars.hip, "", "meta.id;meta.main", "Hipparcos number, 0 for a star without"),
         "name": Column(
-            np.array(
-                ["" if hip else stars.name(k) for k, hip in enumerate(stars.hip.tolist())],
-                dtype=np.str_,
-            ),
+            np.array(names, dtype=np.str_),
             *("", "meta.id", "designation of a star without a HIP number"),
         ),
         "ra_deg": Column(
@@ -449,16 +447,13 @@ def _write_parquet(path: Path, catalogue: InstrumentCatalogue) -> None:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise MachineError(PARQUET) from error
-    fields = [
-        pa.field(
-            name,
-            pa.array(c.values.tolist()).type,
-            metadata={"unit": c.unit, "ucd": c.ucd, "description": c.words},
-        )
-        for name, c in catalogue.columns.items()
-    ]
-    table = pa.table(
-        [pa.array(c.values.tolist()) for c in catalogue.columns.values()], schema=pa.schema(fields)
-    )
+    fields = []
+    arrays = []
+    for name, column in catalogue.columns.items():
+        array = pa.array(column.values.tolist())
+        metadata = {"unit": column.unit, "ucd": column.ucd, "description": column.words}
+        fields.append(pa.field(name, array.type, metadata=metadata))
+        arrays.append(array)
+    table = pa.table(arrays, schema=pa.schema(fields))
     with whole_file(path) as file:
         pq.write_table(table, file)

@@ -529,19 +529,13 @@ def named(found: list[int | str], count: int) -> str:
         return "none"
     bodies = [designation for designation in found if isinstance(designation, str)]
     hips = [designation for designation in found if isinstance(designation, int)]
-    shown = [*bodies, *hips][:count]
-    if len(found) <= count:
-        more = ""
-    else:
-        more = f" and {len(found) - count} more"
-    first_hip = len(bodies)
-    return (
-        ", ".join(
-            f"HIP {designation}" if k == first_hip else str(designation)
-            for k, designation in enumerate(shown)
-        )
-        + more
-    )
+    parts = [*bodies, *map(str, hips)]
+    if hips:
+        parts[len(bodies)] = f"HIP {hips[0]}"
+    text = ", ".join(parts[:count])
+    if len(parts) > count:
+        text += f" and {len(parts) - count} more"
+    return text
 
 
 def clipping_line(bench: Bench) -> str | None:

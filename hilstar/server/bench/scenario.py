@@ -70,10 +70,11 @@ class Scenario:
         """When the last fault with a beginning and an end of its own is over; 0 where there is
         none.
         """
-        return max(
-            (f.at_s + f.for_s for f in self.faults if f.at_s is not None and f.for_s is not None),
-            default=0.0,
-        )
+        end_s = 0.0
+        for fault in self.faults:
+            if fault.at_s is not None and fault.for_s is not None:
+                end_s = max(end_s, fault.at_s + fault.for_s)
+        return end_s
 
     def prepared(self, prepare: Callable[[Fault], Fault]) -> list[Fault]:
         """The faults as `prepare` returns them. Raises InputError with the file and the fault
@@ -202,14 +203,16 @@ class Timetable:
         """The ends of the pieces of a time within which nothing begins, ends or is renewed; the
         time's own among them.
         """
-        found = {begin_ns, end_ns}
+        edges = {begin_ns, end_ns}
         for entry in self._entries:
-            marks = [entry.begin_ns, *([] if entry.end_ns is None else [entry.end_ns])]
+            marks = [entry.begin_ns]
+            if entry.end_ns is not None:
+                marks.append(entry.end_ns)
             if isinstance(entry.fault, CosmicRays):
                 first = max(0, (begin_ns - entry.begin_ns) // self._exposure_ns)
                 marks += [entry.begin_ns + k * self._exposure_ns for k in range(first, first + 3)]
-            found.update(mark for mark in marks if begin_ns < mark < end_ns)
-        return sorted(found)[:MAX_EDGES]
+            edges.update(mark for mark in marks if begin_ns < mark < end_ns)
+        return sorted(edges)[:MAX_EDGES]
 
     def stands_since_ns(self, t_ns: int) -> int | None:
         """When the display began to show the same frame as at a moment, by faults that overlap;
@@ -218,15 +221,15 @@ class Timetable:
         since_ns = None
         while True:
             at_ns = t_ns if since_ns is None else since_ns - 1
-            stuck = [
-                active
-                for active in self.on(at_ns)
-                if isinstance(active.fault, Freeze)
-                or (isinstance(active.fault, Drop) and active.fault.share == 1)
-            ]
+            stuck = [active for active in self.on(at_ns) if _stops_frames(active.fault)]
             if not stuck:
                 return since_ns
             since_ns = min(at_ns - active.since_ns for active in stuck)
+
+
+def _stops_frames(fault: Fault) -> bool:
+    """Whether the display shows the frame before for as long as the fault is on."""
+    return isinstance(fault, Freeze) or (isinstance(fault, Drop) and fault.share == 1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 # The panels of the page; HIDDEN is in the state and the metrics alone, or drawn in another way.
 Panel = Literal["pointing", "source", "run", "tracker", ""]
 HIDDEN: Panel = ""
-# How the page writes a value: a number with its unit, a share as percent, signed numbers, a text,
-# or by the function of that name in `OWN_FORMS` of page/figures.js.
-Form = Literal["number", "share", "signed", "text", "clock", "clipped", "ledger", "reasons"]
+# How the page writes a value, by the function of that name in page/figures.js: a number with its
+# unit, a share as percent, signed numbers, a text, or a text without the advice after its colon.
+Form = Literal[
+    "number", "share", "signed", "text", "clause", "clock", "clipped", "ledger", "reasons"
+]
 COUNTS = "counts."
 DEGREE, DOUBLE_PRIME = "\N{DEGREE SIGN}", "\N{DOUBLE PRIME}"
 PLUS_MINUS, NONE = "\N{PLUS-MINUS SIGN}", "\N{EN DASH}"
@@ -95,7 +97,7 @@ FIGURES = (
         form="signed",
     ),
     PageFigure(panel="pointing", name="Quaternion", key="attitude.q", digits=5, form="signed"),
-    PageFigure(panel="source", name="First attitude", key="pointing", form="text"),
+    PageFigure(panel="source", name="First attitude", key="pointing", form="clause"),
     PageFigure(
         panel="source",
         name="Age at light",

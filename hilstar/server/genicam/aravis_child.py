@@ -1,30 +1,31 @@
-"""Takes a camera's images by Aravis, for a parent: run by the system's Python, which alone has it.
+"""Takes a camera's images by Aravis, for a parent (see `child_lines`): run by the system's Python,
+which alone has it.
 
-    aravis_child.py list         print the cameras, as a JSON list
-    aravis_child.py grab NAME    open a camera and print a line of JSON about it; then one for each
-                                 line read: {"exposure_us": ..., "file": ...} for
-                                 an image, {"set": {...}} for features
-
-NAME is a serial number, VENDOR-MODEL, an address or Aravis's own identifier; "" is the only camera.
-An image's bytes go to `file`, as the camera sent them. It imports nothing of hilstar, and needs
-Debian's gir1.2-aravis-0.8 and python3-gi.
+It imports nothing of hilstar, and needs Debian's gir1.2-aravis-0.8 and python3-gi.
 """
 
-import json
 import re
-import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import gi
 
 gi.require_version("Aravis", "0.8")
+from child_lines import (  # noqa: E402
+    MAX_TAKEN,
+    NEVER_WHOLE,
+    NOTHING_CAME,
+    PATIENCE_S,
+    chosen,
+    main,
+    refuse_format,
+    refuse_padding,
+)
 from gi.repository import Aravis, GLib  # noqa: E402
 
 ADDRESS = re.compile(r"\d+(?:\.\d+){3}")
-BUFFERS = 4
-MAX_TAKEN = 8  # frames for one image: incomplete ones are taken again
-PATIENCE_US = 5_000_000  # beside the exposure
+BUFFERS, FILM_BUFFERS = 4, 40
 
 
 def cameras() -> list[dict[str, str]]:
@@ -43,34 +44,12 @@ def cameras() -> list[dict[str, str]]:
     ]
 
 
-def names_of(camera: dict[str, str]) -> set[str]:
-    """The names by which a camera is meant."""
-    return {
-        camera["id"],
-        camera["serial"],
-        camera["address"],
-        f"{camera['vendor']}-{camera['model']}",
-    }
+class AravisCamera:
+    """An open camera (see `child_lines.OpenCamera`)."""
 
-
-def chosen(name: str) -> str:
-    """The identifier to open. Raises LookupError."""
-    if ADDRESS.fullmatch(name):
-        return name  # asked at its own address: no list is needed
-    seen = cameras()
-    fitting = [camera["id"] for camera in seen if not name or name in names_of(camera)]
-    if len(fitting) == 1:
-        return fitting[0]
-    listed = ", ".join(f"{camera['id']} ({camera['address']})" for camera in seen) or "none"
-    if not seen:
-        raise LookupError("no camera is there; write its address, such as genicam:192.168.1.10")
-    raise LookupError(f"genicam:{name} fits {len(fitting)} of the cameras here: {listed}")
-
-
-class Camera:
-    """An open camera."""
-
-    def __init__(self, identifier: str) -> None:
+    def __init__(self, name: str) -> None:
+        # asked at its own address: no list is needed
+        identifier = name if ADDRESS.fullmatch(name) else chosen(name, cameras())
         self.camera = Aravis.Camera.new(identifier)
         self.device = self.camera.get_device()
         # The exposure is who asks's own, and so is the light of an image.
@@ -80,14 +59,10 @@ class Camera:
             self.camera.set_gain_auto(Aravis.Auto.OFF)
 
     def adjust(self, features: dict[str, Any]) -> None:
-        """Set features by their names, the pixel format first."""
+        """Set features by their names."""
         for name, value in features.items():
             if name == "PixelFormat":
-                formats = self.camera.dup_available_pixel_formats_as_strings()
-                if value not in formats:
-                    raise LookupError(
-                        f"the camera has no PixelFormat {value}; it has {', '.join(formats)}"
-                    )
+                refuse_format(value, self.camera.dup_available_pixel_formats_as_strings())
             if isinstance(value, bool):
                 self.device.set_boolean_feature_value(name, value)
             elif isinstance(value, int):
@@ -109,22 +84,12 @@ class Camera:
 
     def take(self, exposure_us: float, path: Path) -> dict[str, Any]:
         """Expose once after now, and write the image's bytes."""
-        self.camera.set_exposure_time(exposure_us)
-        payload = self.camera.get_payload()
-        stream = self.camera.create_stream(None, None)
-        for _ in range(BUFFERS):
-            stream.push_buffer(Aravis.Buffer.new_allocate(payload))
-        self.camera.start_acquisition()
+        stream = self._started(exposure_us, BUFFERS)
         try:
             buffer, taken = self._complete(stream, exposure_us)
         finally:
             self.camera.stop_acquisition()
-        pad_bytes, _ = buffer.get_image_padding()
-        if pad_bytes:
-            raise LookupError(
-                f"each line of its image ends with {pad_bytes} bytes of padding; set another Width"
-            )
-        path.write_bytes(buffer.get_image_data())
+        path.write_bytes(data_of(buffer))
         return {
             "format": self.camera.get_pixel_format_as_string(),
             "width": buffer.get_image_width(),
@@ -134,24 +99,70 @@ class Camera:
             "incomplete": taken - 1,
         }
 
+    def film(
+        self, exposure_us: float, path: Path, seconds: float, rows: list[int] | None
+    ) -> dict[str, Any]:
+        """Expose again and again for some time, and write rows of each image."""
+        stream = self._started(exposure_us, FILM_BUFFERS)
+        frames: list[tuple[int, int]] = []
+        incomplete = 0
+        size = (0, 0)
+        end_s = time.monotonic() + seconds
+        try:
+            with path.open("wb") as output:
+                while time.monotonic() < end_s:
+                    buffer = stream.timeout_pop_buffer(patience_us(exposure_us))
+                    if buffer is None:
+                        raise LookupError(NOTHING_CAME)
+                    if buffer.get_status() == Aravis.BufferStatus.SUCCESS:
+                        data = data_of(buffer)
+                        size = buffer.get_image_width(), buffer.get_image_height()
+                        row_bytes = len(data) // size[1]
+                        first, last = rows or (0, size[1])
+                        output.write(data[first * row_bytes : last * row_bytes])
+                        frames.append((buffer.get_timestamp(), buffer.get_system_timestamp()))
+                    else:
+                        incomplete += 1
+                    stream.push_buffer(buffer)
+        finally:
+            self.camera.stop_acquisition()
+        return {
+            "format": self.camera.get_pixel_format_as_string(),
+            "width": size[0],
+            "height": size[1],
+            "exposure_us": self.camera.get_exposure_time(),
+            "frames": frames,
+            "incomplete": incomplete,
+        }
+
+    def close(self) -> None:
+        """Let it go at once."""
+        if self.camera.is_gv_device():
+            self.device.leave_control()
+
+    def _started(self, exposure_us: float, buffers: int) -> Any:
+        """The stream of an acquisition with an exposure."""
+        self.camera.set_exposure_time(exposure_us)
+        payload = self.camera.get_payload()
+        stream = self.camera.create_stream(None, None)
+        for _ in range(buffers):
+            stream.push_buffer(Aravis.Buffer.new_allocate(payload))
+        self.camera.start_acquisition()
+        return stream
+
     def _complete(self, stream: Any, exposure_us: float) -> tuple[Any, int]:
         """The first complete buffer, and how many there were up to it."""
         triggered = self._is_triggered()
         for taken in range(1, MAX_TAKEN + 1):
             if triggered:
                 self.camera.software_trigger()
-            buffer = stream.timeout_pop_buffer(int(2 * exposure_us) + PATIENCE_US)
+            buffer = stream.timeout_pop_buffer(patience_us(exposure_us))
             if buffer is None:
-                raise LookupError(
-                    "no image came; look at the camera's link, its trigger and a firewall"
-                )
+                raise LookupError(NOTHING_CAME)
             if buffer.get_status() == Aravis.BufferStatus.SUCCESS:
                 return buffer, taken
             stream.push_buffer(buffer)
-        raise LookupError(
-            f"{MAX_TAKEN} images in a row came incomplete; look at the link, or a smaller packet"
-            " size"
-        )
+        raise LookupError(NEVER_WHOLE)
 
     def _is_triggered(self) -> bool:
         try:
@@ -161,42 +172,17 @@ class Camera:
         return mode == "On"
 
 
-def serve(name: str) -> None:
-    """Open a camera, say what it is, and do what each line asks."""
-    camera = Camera(chosen(name))
-    say(camera.about())
-    for line in sys.stdin:
-        asked = json.loads(line)
-        try:
-            if "set" in asked:
-                camera.adjust(asked["set"])
-                say({})
-            else:
-                say(camera.take(asked["exposure_us"], Path(asked["file"])))
-        except (LookupError, GLib.Error) as error:
-            say({"error": words_of(error)})
+def patience_us(exposure_us: float) -> int:
+    """How long an image may take."""
+    return int(2 * exposure_us + PATIENCE_S * 1e6)
 
 
-def words_of(error: Exception) -> str:
-    """What an error says."""
-    return str(getattr(error, "message", "") or error.args[0])
-
-
-def say(answer: object) -> None:
-    """A line for the parent."""
-    print(json.dumps(answer), flush=True)
-
-
-def main() -> None:
-    """Do what the command line asks."""
-    if sys.argv[1] == "list":
-        say(cameras())
-        return
-    try:
-        serve(sys.argv[2])
-    except (LookupError, GLib.Error) as error:
-        say({"error": words_of(error)})
+def data_of(buffer: Any) -> bytes:
+    """The bytes of an image. Raises LookupError for lines that are padded."""
+    refuse_padding(buffer.get_image_padding()[0])
+    data: bytes = buffer.get_image_data()
+    return data
 
 
 if __name__ == "__main__":
-    main()
+    main(cameras, AravisCamera, (LookupError, GLib.Error))

@@ -1,13 +1,17 @@
-"""A GenICam camera of this machine, opened by Aravis in a child of the system's Python."""
+"""A GenICam camera of this machine, opened in a child: by Aravis in the system's Python, or by
+Harvesters and a vendor's GenTL producer in this one.
+"""
 
 import json
 import os
 import select
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +27,17 @@ PREFIX = "genicam:"
 # A virtual environment cannot import Debian's `gi`: the system's own Python can.
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 CHILD = Path(__file__).with_name("aravis_child.py")
+HARVESTERS_CHILD = Path(__file__).with_name("harvesters_child.py")
 PROBE = "import gi; gi.require_version('Aravis', '0.8'); from gi.repository import Aravis"
-INSTALL = "install Aravis: sudo apt-get install gir1.2-aravis-0.8 python3-gi"
+PRODUCERS = "GENICAM_GENTL64_PATH"
+INSTALL = (
+    "install Aravis: sudo apt-get install gir1.2-aravis-0.8 python3-gi; or the vendor's GenTL"
+    f' producer, whose directory is in {PRODUCERS}, and pip install "hilstar[genicam]"'
+)
 LIST_TIMEOUT_S = 15.0
 OPEN_TIMEOUT_S = 30.0
 GRAB_TIMEOUT_S = 60.0
+CLOSE_TIMEOUT_S = 2.0
 # Of an exposure as it was asked for: a camera sets it in steps of a row or a microsecond.
 EXPOSURE_TOLERANCE, EXPOSURE_STEP_US = 0.01, 20.0
 
@@ -40,13 +50,35 @@ def has_aravis() -> bool:
     return probe.returncode == 0
 
 
-def list_cameras() -> list[dict[str, str]]:
-    """The cameras that Aravis sees: `id`, `vendor`, `model`, `serial`, `address` and
-    `protocol`; none without Aravis.
+def has_harvesters() -> bool:
+    """Whether Harvesters is installed and there is a GenTL producer for it."""
+    folders = os.environ.get(PRODUCERS, "").split(os.pathsep)
+    has_producer = any(folder and any(Path(folder).glob("*.cti")) for folder in folders)
+    return has_producer and find_spec("harvesters") is not None
+
+
+def child_command() -> list[str] | None:
+    """What runs a child that opens cameras; None where nothing here can.
+
+    A producer is there on purpose, and goes before Aravis.
     """
+    if has_harvesters():
+        return [sys.executable, str(HARVESTERS_CHILD)]
+    if has_aravis():
+        return [str(SYSTEM_PYTHON), str(CHILD)]
+    return None
+
+
+def list_cameras() -> list[dict[str, str]]:
+    """The cameras of this machine: `id`, `vendor`, `model`, `serial`, `address` and `protocol`;
+    none where nothing here can open one.
+    """
+    command = child_command()
+    if command is None:
+        return []
     try:
         listed = subprocess.run(
-            [SYSTEM_PYTHON, CHILD, "list"],
+            [*command, "list"],
             capture_output=True,
             text=True,
             timeout=LIST_TIMEOUT_S,
@@ -76,6 +108,21 @@ class CameraImage:
     incomplete: int
 
 
+@dataclass(frozen=True, slots=True)
+class Film:
+    """Images of a camera that exposes again and again: DN (n, rows, columns) in their order.
+
+    `stamp_ns` (n,) are their times by the camera's clock, and `arrived_utc_ns` (n,) when their
+    first bytes came. `incomplete` ones are not among them.
+    """
+
+    dn: npt.NDArray[np.unsignedinteger]
+    stamp_ns: npt.NDArray[np.int64]
+    arrived_utc_ns: npt.NDArray[np.int64]
+    exposure_s: float
+    incomplete: int
+
+
 class CameraError(MachineError):
     """What a camera answers to a request that it refuses."""
 
@@ -84,19 +131,19 @@ class GenicamCamera(Closing):
     """A camera, opened and set. Free it with `close`.
 
     `name` is a serial number, VENDOR-MODEL or an address, "" the only camera. Raises MachineError
-    where Aravis or the camera is not there.
+    where nothing here can open one, or the camera is not there.
     """
 
     def __init__(self, name: str) -> None:
-        if not has_aravis():
+        child = child_command()
+        if child is None:
             raise MachineError(f"--grab {PREFIX}{name}: {INSTALL}")
         self.name = name
         self._folder = tempfile.TemporaryDirectory(prefix="hilstar-camera-")
         self._file = Path(self._folder.name) / "image"
         self._asked: tuple[float, float] | None = None  # an exposure, us, and until when, s
-        command = [str(SYSTEM_PYTHON), str(CHILD), "grab", name]
         self._child = subprocess.Popen(
-            command,
+            [*child, "grab", name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -117,8 +164,8 @@ class GenicamCamera(Closing):
         except CameraError as error:
             raise InputError(f"[tracker.camera]: {error}") from error
 
-    def _awaited(self) -> dict[str, Any]:
-        end_s = time.monotonic() + OPEN_TIMEOUT_S
+    def _awaited(self, seconds: float = OPEN_TIMEOUT_S) -> dict[str, Any]:
+        end_s = time.monotonic() + seconds
         while (answer := self._answer()) is None:
             self._check_time(end_s, "does not answer")
             time.sleep(0.01)
@@ -168,6 +215,41 @@ class GenicamCamera(Closing):
             time.sleep(0.002)
         return image
 
+    def film(self, exposure_s: float, seconds: float, rows: tuple[int, int] | None = None) -> Film:
+        """Images of `seconds`; of each the rows from the first to before the last, or all.
+
+        The pixel format is one of whole bytes a pixel. They lie in a file until the next image.
+        Raises MachineError, InputError.
+        """
+        exposure_us = exposure_s * 1e6
+        self._ask(
+            {"exposure_us": exposure_us, "file": str(self._file), "film": seconds, "rows": rows}
+        )
+        answer = self._awaited(seconds + GRAB_TIMEOUT_S)
+        self._check_exposure(exposure_us, answer["exposure_us"])
+        match = FORMAT.fullmatch(answer["format"])
+        if match is None or match[3]:
+            raise InputError(
+                self._said(
+                    f"films in {answer['format']}; write [tracker.camera] pixel_format of whole"
+                    ' bytes, such as "Mono8"'
+                )
+            )
+        count = len(answer["frames"])
+        if not count:
+            raise MachineError(self._said("gave no whole image; look at its link"))
+        first, last = rows or (0, answer["height"])
+        kind = np.dtype(np.uint8 if match[2] == "8" else "<u2")
+        shape = count, last - first, answer["width"]
+        stamp_ns, arrived_ns = np.array(answer["frames"], dtype=np.int64).T
+        return Film(
+            np.memmap(self._file, dtype=kind, mode="r", shape=shape),
+            stamp_ns,
+            arrived_ns,
+            answer["exposure_us"] / 1e6,
+            answer["incomplete"],
+        )
+
     def _check_exposure(self, asked_us: float, exposure_us: float) -> None:
         off_us = abs(exposure_us - asked_us)
         if off_us > max(EXPOSURE_TOLERANCE * asked_us, EXPOSURE_STEP_US):
@@ -213,9 +295,13 @@ class GenicamCamera(Closing):
         return f"--grab {PREFIX}{self.name}: {what}"
 
     def close(self) -> None:
-        """Let the camera go."""
-        self._child.kill()
-        self._child.communicate()
+        """Let the camera go, for the next who opens it."""
+        # With its input at an end the child lets it go; in the middle of an exposure it cannot.
+        try:
+            self._child.communicate(timeout=CLOSE_TIMEOUT_S)
+        except (subprocess.TimeoutExpired, ValueError):  # it is late, or has been closed
+            self._child.kill()
+            self._child.wait()
         self._folder.cleanup()
 
 

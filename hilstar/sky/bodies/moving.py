@@ -28,6 +28,7 @@ from hilstar.sky.bodies.earth_disc import (
 )
 from hilstar.sky.bodies.kernel import (
     DAY_S,
+    UNIX_JD,
     Kernel,
     Viewpoint,
     apparent_bodies,
@@ -92,11 +93,11 @@ START = SkyMoment(0)
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The bodies as an observer sees them at a moment: vectors (n, 3), km, its viewpoint, and unit
-    vectors.
+    """Bodies as an observer sees them at a moment: vectors `seen_km` (n, 3), unit vectors (n, 3),
+    and the viewpoint.
 
-    An Earth about the observer stands anywhere. `place_km` and `about_earth_km_s` (3,) are the
-    observer's about its centre.
+    From the Earth's own centre the direction to the Earth means nothing. `place_km` and
+    `about_earth_km_s` (3,) are the observer's place and velocity about that centre.
     """
 
     seen_km: FloatArray
@@ -387,11 +388,14 @@ class MovingSky:
         """The apparent equatorial diameter of each body, arcsec."""
         sight = self.sight(self._within(t_ns))
         distance_km = np.linalg.norm(sight.seen_km[self._drawn], axis=1)
-        return {
-            name: 2 * float(np.arcsin(min(1.0, RADII_KM[name] / d))) * ARCSEC_PER_RAD
-            for name, d in zip(self.names, distance_km, strict=True)
-            if name != EARTH or not at_centre(sight.place_km)
-        }
+        diameters = {}
+        for name, body_km in zip(self.names, distance_km, strict=True):
+            # from its centre the Earth has no diameter
+            if name == EARTH and at_centre(sight.place_km):
+                continue
+            radius_rad = float(np.arcsin(min(1.0, RADII_KM[name] / body_km)))
+            diameters[name] = 2 * radius_rad * ARCSEC_PER_RAD
+        return diameters
 
     def _compute_span(self, span: int) -> Span:
         if self._unix:
@@ -484,20 +488,17 @@ class MovingSky:
         """
         first = self._kernel.first_jd + EDGE_DAYS
         last = self._kernel.last_jd - EDGE_DAYS
-        limits = tuple(
-            round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S)
-            for jd in (first, last)
-        )
-        if not limits[0] <= 0 <= limits[1]:
-            dates = [
-                str(np.datetime64(round((jd - 2_440_587.5) * DAY_S), "s").astype("datetime64[D]"))
-                for jd in (first, last)
-            ]
+        first_ns, last_ns = self._since_ns(first), self._since_ns(last)
+        if not first_ns <= 0 <= last_ns:
             raise InputError(
-                f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date"
-                " between them"
+                f"[sky] epoch_utc: the ephemeris covers {_date(first)} to {_date(last)}; write a"
+                " date between them"
             )
-        return limits[0], limits[1]
+        return first_ns, last_ns
+
+    def _since_ns(self, jd: float) -> int:
+        """The time from the start to a Julian date, ns."""
+        return round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S)
 
     def _within(self, t_ns: int | None) -> int:
         """A time since the start, held within the ephemeris; a far one is told once, as it is
@@ -514,6 +515,11 @@ class MovingSky:
                 since_ns / YEAR_NS,
             )
         return min(max(since_ns, self._limits_ns[0]), self._limits_ns[1])
+
+
+def _date(jd: float) -> str:
+    """The day of a Julian date."""
+    return str(np.datetime64(round((jd - UNIX_JD) * DAY_S), "s").astype("datetime64[D]"))
 
 
 def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatArray | None:

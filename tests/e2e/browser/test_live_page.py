@@ -224,6 +224,7 @@ Promise.all([import("/static/health.js"), import("/static/figures.js")]).then(([
     { set: (name, text, shade) => (rows[name] = [text, shade]) });
   const tracker = { rms_arcsec: [1.25, -2, 3], availability: 0.914, rate_hz: 10, refused: { crc: 2 }, trouble: "" };
   figures.writeFigures("tracker", { tracker }, { set: (name, text, shade) => (rows[name] = [text, shade]) });
+  figures.writeFigures("source", { pointing: "the first attitude points at RA 84.0; Rigel is in view: compare" }, { set: (name, text) => (rows[name] = text) });
   done([judged.headline, judged.reasons, rows]);
 });
 """
@@ -239,6 +240,7 @@ def test_late_frames_are_no_wrong_sky_and_stars_have_the_pictures_names(live):
     assert rows["Missed"] == ["2", "warn"] and rows["Frames"] == ["\u2013", ""]
     assert rows["Rms"][0].replace("\u00a0", " ") == "+1.3  \u22122.0  +3.0\u2033"
     assert rows["Availability"][0].replace("\u00a0", " ") == "91.4 % at 10.0 Hz"
+    assert rows["First attitude"] == "the first attitude points at RA 84.0; Rigel is in view"
     assert rows["Refused"] == ["2 crc", "warn"] and rows["Line"] == ["in order", ""]
 
 

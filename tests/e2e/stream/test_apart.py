@@ -27,10 +27,11 @@ from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.attitude.wire.roads import LinkCounts, RawMessage
+from hilstar.attitude.wire.roads import ANSWERS, ByteRoad, LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialApart
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.udp import Datagrams, UdpLink
+from hilstar.attitude.wire.tcp import TcpRoad
+from hilstar.attitude.wire.udp import UdpLink, UdpRoad
 from hilstar.attitude.wire.vizard import DifferenceRates, Follower, vizard_broadcast
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 from hilstar.basics.notices import Notices
@@ -259,36 +260,48 @@ def test_basilisks_topic_and_long_messages_pass_through():
     assert last.raw == long
 
 
-def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        datagrams = Datagrams.bound(bound_place("127.0.0.1:0", "", None))
-        sender.connect(("127.0.0.1", datagrams.port))
+@contextmanager
+def udp_bytes() -> Iterator[tuple[ByteRoad, socket.socket]]:
+    with (
+        UdpRoad(bound_place("127.0.0.1:0", "", None), AllowedSenders(), ANSWERS) as road,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        sender.connect(("127.0.0.1", int(road.endpoint.rpartition(":")[2])))
+        yield road, sender
 
-        def held(count: int) -> list[tuple[int, int]]:
-            """How long after each began to be sent, and after it was sent, so many datagrams
-            that were read late arrived.
+
+@contextmanager
+def tcp_bytes() -> Iterator[tuple[ByteRoad, socket.socket]]:
+    place = ("127.0.0.1", 0)
+    with TcpRoad(place, AllowedSenders(), ANSWERS, listening=True) as road:
+        port = int(road.endpoint.rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port)) as sender:
+            wait_for(lambda: not road.taken(20) and road.openings == 1, "the connection")
+            yield road, sender
+
+
+@pytest.mark.parametrize("kind", [udp_bytes, tcp_bytes])
+def test_what_was_read_late_has_the_time_of_its_arrival(kind):
+    with kind() as (road, sender):
+
+        def held() -> tuple[int, int]:
+            """How long after it began to be sent, and after it was sent, what is read late
+            arrived.
             """
-            sent_ns = []
-            for _ in range(count):
-                before_ns = time.monotonic_ns()
-                sender.send(b"now")
-                sent_ns.append((before_ns, time.monotonic_ns()))
-                time.sleep(HELD_S)
-            taken = datagrams.take(2 * count)
-            return [
-                (each.host_ns - began, each.host_ns - ended)
-                for each, (began, ended) in zip(taken, sent_ns, strict=True)
-            ]
+            before_ns = time.monotonic_ns()
+            sender.send(b"now")
+            after_ns = time.monotonic_ns()
+            time.sleep(HELD_S)
+            (message,) = road.taken(0)
+            return message.host_ns - before_ns, message.host_ns - after_ns
 
         # The kernel switches its stamps on from a work queue, some time after the socket asks for
         # them.
-        wait_for(lambda: held(1)[0][1] < STAMP_NS, "stamps")
-        late_ns = held(5)
-        datagrams.close()
-    # The stamp is made while the datagram is sent, however long this process is held up there.
-    assert all(
-        after_begin > -STAMP_NS and after_end < STAMP_NS for after_begin, after_end in late_ns
-    ), late_ns
+        wait_for(lambda: held()[1] < STAMP_NS, "stamps")
+        late_ns = [held() for _ in range(5)]
+    # The stamp is made while it is sent, however long this process is held up there.
+    for after_begin_ns, after_end_ns in late_ns:
+        assert after_begin_ns > -STAMP_NS and after_end_ns < STAMP_NS, late_ns
 
 
 def test_records_come_out_whole_however_they_were_cut():

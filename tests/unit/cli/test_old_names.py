@@ -44,6 +44,27 @@ def test_no_help_shows_a_former_name(command, old):
         assert old not in options_of(command)
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--frames", "N"),
+        ("--rate", "HZ"),
+        ("--at", "SECONDS"),
+        ("--to", "TARGET"),
+        ("--duration", "SECONDS"),
+        ("--wait", "SECONDS"),
+        ("--feed", "ENDPOINT"),
+    ],
+)
+def test_an_option_has_one_meaning_in_all_commands(option, value):
+    values = []
+    for name, command in built(None).commands.items():
+        for inner in getattr(command, "commands", {name: command}).values():
+            values += [p.metavar for p in inner.params if option in p.opts]
+    assert values
+    assert set(values) == {value}
+
+
 @pytest.mark.parametrize("command", COUNTED)
 def test_frames_with_an_endpoint_feed_who_watches(command):
     typed = [command, "bench.toml", "--frames", "5", "--frames", ENDPOINT]

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
-from hilstar.optics.camera import Lens, ResidualField, bounded, field_terms
+from hilstar.optics.camera import Lens, ResidualField, bounded, field_terms, ray_shifts
 
 SIZE = (1920, 1080)
 PINHOLE = monitor_camera(SIZE, 57.65, 350.0, np.array([1.0, 0.0, 0.0, 0.0]))
@@ -100,3 +100,36 @@ def test_the_fastest_star_is_as_fast_as_finite_differences_say(rng):
     x1, y1 = camera.project(moved)
     fastest = np.nanmax(np.hypot(x1 - x.ravel(), y1 - y.ravel())) / step_s
     assert camera.fastest_px_s(rate) == pytest.approx(fastest, rel=0.02)
+
+
+def test_decentring_is_brown_s_as_opencv_writes_it(rng):
+    """x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and so with y, p1 and p2."""
+    k1, k2, k3, p1, p2 = 0.3, -0.2, 0.1, 0.02, -0.05
+    x, y = rng.uniform(-0.3, 0.3, (2, 50))
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    bent_x, bent_y = Lens((k1, k2, k3), (p1, p2)).bent(x, y)
+    np.testing.assert_allclose(bent_x, x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2))
+    np.testing.assert_allclose(bent_y, y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y)
+
+
+def test_an_image_spans_half_a_pixel_beyond_the_centres_of_its_outer_pixels():
+    width, height = SIZE
+    inside = 1e-9
+    x = np.array([-0.5, width - 0.5, 0.0, 0.0])
+    y = np.array([0.0, 0.0, -0.5, height - 0.5])
+    outward = np.array([[-1, 1, 0, 0], [0, 0, -1, 1]]) * inside
+    assert PINHOLE.contains_px(x - outward[0], y - outward[1]).all()
+    assert not PINHOLE.contains_px(x + outward[0], y + outward[1]).any()
+
+
+def test_the_shader_s_map_of_a_lens_runs_from_edge_to_edge_of_the_image():
+    camera = bounded(replace(PINHOLE, lens=Lens((0.6, 0.0, 0.0))), MARGIN_PX)
+    shifts = ray_shifts(camera)
+    width, height = SIZE
+    for row, y in ((0, -0.5), (-1, height - 0.5)):
+        for column, x in ((0, -0.5), (-1, width - 0.5)):
+            place = np.array([x]), np.array([y])
+            lens = np.ravel(camera.tangents(*place))
+            pinhole = np.ravel(PINHOLE.tangents(*place))
+            np.testing.assert_allclose(shifts[row, column], lens - pinhole, rtol=1e-6)

@@ -69,3 +69,22 @@ def test_the_background_of_whole_numbers_is_that_of_their_pixels(shape):
     )
     assert counted.level == pytest.approx(by_pixel.level, rel=1e-12)
     assert counted.noise == pytest.approx(by_pixel.noise, rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(30, 60), (60, 30)])
+def test_a_star_is_at_the_edge_where_its_window_leaves_a_wide_or_a_tall_image(shape):
+    """The window reaches 3 px: its middle pixel is on the first or last three rows or columns."""
+    height, width = shape
+    settings = CentroidSettings(window_sigma_px=1.3, window_radius_px=3)
+
+    def is_at_edge(x: int, y: int) -> bool:
+        image = np.zeros(shape)
+        image[y, x] = 100.0
+        (star,) = find_stars(image, settings, BACKGROUND).at_edge
+        return bool(star)
+
+    middle_x, middle_y = width // 2, height // 2
+    for x in (2, 3, width - 4, width - 3):
+        assert is_at_edge(x, middle_y) == (x in (2, width - 3))
+    for y in (2, 3, height - 4, height - 3):
+        assert is_at_edge(middle_x, y) == (y in (2, height - 3))

@@ -626,3 +626,14 @@ def test_a_sensor_that_cannot_be_is_refused(wrong, words):
 def test_a_sensor_without_pixels_is_refused():
     with pytest.raises(InputError, match="resolution"):
         Detector(DetectorSettings(), (0, 10))
+
+
+def test_a_frame_transfer_smears_a_column_by_the_share_of_the_exposure_that_a_shift_takes():
+    """2 us a row in 0.1 s: each pixel of a column gets 2e-5 of the column's light."""
+    light_e = flat(0.0)
+    light_e[40, 70] = 1e6
+    settings = DetectorSettings(shutter="frame-transfer", row_shift_us=2.0)
+    detector = Detector(settings, SIZE_PX)
+    smeared_e = detector.collected_e(light_e, 0.1) - light_e
+    np.testing.assert_allclose(smeared_e[:, 70], 2e-5 * 1e6)
+    assert not np.delete(smeared_e, 70, axis=1).any()

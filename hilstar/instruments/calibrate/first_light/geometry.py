@@ -164,7 +164,9 @@ class SeenFigure:
 
     @property
     def whole_turn_deg(self) -> float:
-        """The turn that is left, with the quarter turn of an orientation that is not upright."""
+        """The turn of the screen in the tracker's image, degrees: the quarter turns of its
+        orientation and the remaining angle.
+        """
         return self.turn_deg + QUARTER_TURNS_DEG.get(self.way, 0.0)
 
 
@@ -320,10 +322,9 @@ def orientation(context: StepContext) -> StepOutcome:
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
-    keys = ("flip_x", "flip_y", "rotate_deg")
-    changes = tuple(
-        change for key in keys for change in context.change("monitor", key, getattr(after, key))
-    )
+    changes: tuple[KeyChange, ...] = ()
+    for key in ("flip_x", "flip_y", "rotate_deg"):
+        changes += tuple(context.change("monitor", key, getattr(after, key)))
     if (before.rotate_deg - after.rotate_deg) % 180:
         width, height = monitor.resolution_px
         changes += (

@@ -5,6 +5,7 @@ virtual bench.
 import dataclasses
 import datetime
 import hashlib
+import itertools
 import logging
 import math
 import shlex
@@ -827,10 +828,12 @@ class VirtualBench(ImageSource):
         frames = []
         for codes in pattern.frames:
             frames.append(np.ascontiguousarray(off_screen(on_screen(codes, mine), its)))
-        shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
-        image = self._image_e_per_s(
-            [frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)]
-        )
+        # the frames in turn for as long as the exposure lasts; a single one has the same mean
+        shown = 1
+        if len(frames) > 1:
+            shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
+        in_exposure = itertools.islice(itertools.cycle(frames), shown)
+        image = self._image_e_per_s(list(in_exposure))
         half_ns = round(
             NS_PER_S * max(exposure_s, self.truth.config.certify.virtual.seconds_a_reading) / 2
         )

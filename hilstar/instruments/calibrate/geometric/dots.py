@@ -337,12 +337,11 @@ def dot_image(
 def write_plan(path: Path, plan: DotPlan) -> None:
     """Write plan.csv, a row for each lit dot of each frame."""
     places = np.stack([plan.x_px, plan.y_px], axis=1).astype(int).tolist()
-    lit = (
-        (frame, dot)
-        for frame in range(plan.frames)
-        for dot in np.flatnonzero(plan.lit[:, frame]).tolist()
-    )
-    write_csv(path, PLAN_COLUMNS, ((frame, dot, *places[dot]) for frame, dot in lit))
+    rows = []
+    for frame in range(plan.frames):
+        for dot in np.flatnonzero(plan.lit[:, frame]).tolist():
+            rows.append((frame, dot, *places[dot]))
+    write_csv(path, PLAN_COLUMNS, rows)
 
 
 def read_plan(path: Path) -> DotPlan:

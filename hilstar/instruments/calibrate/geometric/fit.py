@@ -262,10 +262,10 @@ class _Loss:
             base = self._off(bare, directions)
         else:
             base = off
-        offs = [
-            self._off(g, directions if n < len(self.model.names) else None)
-            for n, g in enumerate(varied)
-        ]
+        offs = []
+        for number, geometry in enumerate(varied):
+            is_of_monitor = number < len(self.model.names)
+            offs.append(self._off(geometry, directions if is_of_monitor else None))
         slope = np.stack([(trial - base) / DIFFERENCE for trial in offs], axis=1)
         is_its = np.tile(seen_dots.pose, 2)[:, None] == np.repeat(np.arange(1, poses + 1), 3)
         columns = np.hstack(
@@ -483,10 +483,9 @@ def held_out(
         np.nan_to_num(off, nan=np.inf) * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
     )
     count = np.bincount(data.dot, minlength=len(fold))[dots]
-    means = np.stack(
-        [np.bincount(data.dot, arcsec[:, k], minlength=len(fold))[dots] / count for k in (0, 1)],
-        axis=1,
-    )
+    sum_x = np.bincount(data.dot, arcsec[:, 0], minlength=len(fold))[dots]
+    sum_y = np.bincount(data.dot, arcsec[:, 1], minlength=len(fold))[dots]
+    means = np.stack([sum_x / count, sum_y / count], axis=1)
     return Candidate(name, model, degree, dots, means)
 
 
@@ -631,7 +630,9 @@ def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
 
 
 def _with_whole_lens(fit: Fit) -> Fit:
-    """The same geometry as a fit of the whole lens, whose further parameters are 0."""
+    """The same geometry as a fit of BROWN_CONRADY, whose parameters are 0 where the model lacks
+    them.
+    """
     names = fit.model.names
     own_count = len(fit.model.names)
     if names == BROWN_CONRADY:

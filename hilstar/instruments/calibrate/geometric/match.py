@@ -245,13 +245,8 @@ def _map_of(
     x = plan.x_px[decoded.dot]
     y = plan.y_px[decoded.dot]
     best = np.zeros(len(u), dtype=bool)
-    fours = np.array(
-        [
-            rng.choice(len(u), 4, replace=False)
-            for _ in range(TRIALS if len(u) >= MIN_DECODED else 0)
-        ],
-        dtype=int,
-    )
+    trials = TRIALS if len(u) >= MIN_DECODED else 0
+    fours = np.array([rng.choice(len(u), 4, replace=False) for _ in range(trials)], dtype=int)
     fours = fours[np.isfinite((u + v)[fours]).all(axis=-1)].reshape(-1, 4)
     for trial in homography(u[fours], v[fours], x[fours], y[fours]):
         seen_x, seen_y = mapped(trial, u, v)

@@ -145,9 +145,10 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
         )
     typical = float(np.median(counts[counts > 0]))
     average = fields[np.argmin(np.abs(counts - typical))]
-    brightest = np.array(
-        [rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in star_rates]
-    )
+    brightest = np.full(len(star_rates), np.inf)
+    for number, rates in enumerate(star_rates):
+        if len(rates) >= ENOUGH * typical:
+            brightest[number] = rates.max()
     faint = fields[np.argmin(brightest)]
     dense = fields[np.argmax(counts)]
     return (

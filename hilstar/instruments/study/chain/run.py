@@ -88,15 +88,17 @@ def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
     by_arcsec, by_mag = (front(rows, name) for name in ("error_arcsec", "error_mag"))
     filed = [k for k, row in enumerate(rows) if left_to_effort(row, rows[auto_of(rows)])]
     as_filed = dict(zip(filed, front([rows[k] for k in filed], "error_arcsec"), strict=True))
-    return [
-        replace(
-            row,
-            on_front=said(a),
-            on_front_mag=said(m),
-            on_front_as_filed=said(as_filed.get(k, False)),
+    with_fronts: list[CombinationRow] = []
+    for k, row in enumerate(rows):
+        with_fronts.append(
+            replace(
+                row,
+                on_front=said(by_arcsec[k]),
+                on_front_mag=said(by_mag[k]),
+                on_front_as_filed=said(as_filed.get(k, False)),
+            )
         )
-        for k, (row, a, m) in enumerate(zip(rows, by_arcsec, by_mag, strict=True))
-    ]
+    return with_fronts
 
 
 def without_fronts(row: CombinationRow) -> CombinationRow:
@@ -155,17 +157,19 @@ def scene_line(
     """One scene: the choice of `auto`, its error and time, its place relative to the front, and
     the largest part of each.
     """
-    own = rows[auto_of(rows)]
+    auto_row = rows[auto_of(rows)]
     stands = NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
     largest = max(steps, key=lambda part: part.error_arcsec)
     longest = max(stages, key=lambda one: one.time_ms)
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
+    stars = f"{auto_row.stars} stars"
+    if auto_row.lost:
+        stars += f", {auto_row.lost} of them lost"
     return (
-        f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and"
-        f" {own.error_mag:.2g} mag off over {own.stars}"
-        f" stars{f', {own.lost} of them lost' if own.lost else ''}, in {own.time_ms:.3g} ms;"
-        f" {stands}; error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage}"
+        f"{auto_row.scene}: {AUTO} ({words(auto_row)}) is {auto_row.error_arcsec:.3g} arcsec and"
+        f" {auto_row.error_mag:.2g} mag off over {stars}, in {auto_row.time_ms:.3g} ms; {stands};"
+        f" error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage}"
         f" {share:.0%}"
     )
 

@@ -128,11 +128,11 @@ def meanings_of(table: type) -> dict[str, str]:
             first = key.lineno - 1
             while lines[first - 1].lstrip().startswith("#:"):
                 first -= 1
-            meaning = " ".join(
-                line.partition("#:")[2].strip()
-                for line in lines[first : key.end_lineno]
-                if "#:" in line
-            )
+            notes = []
+            for line in lines[first : key.end_lineno]:
+                if "#:" in line:
+                    notes.append(line.partition("#:")[2].strip())
+            meaning = " ".join(notes)
             for name, filling in FILLED_IN.items():
                 meaning = meaning.replace(f"{{{name}}}", filling)
             meanings[key.target.id] = meaning
@@ -155,13 +155,12 @@ def row(field: FieldInfo, hint: Any, told: str) -> str:
 def notes_of(hint: Any) -> list[Meta]:
     """The notes in the annotations of a type, inner ones first; those of `X | None` are X's too."""
     kind, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    inner = [
-        note
-        for choice in get_args(kind)
-        if get_origin(choice) is Annotated
-        for note in notes_of(choice)
-    ]
-    return (inner if is_optional(kind) else []) + [note for note in notes if isinstance(note, Meta)]
+    metas: list[Meta] = []
+    if is_optional(kind):
+        for choice in get_args(kind):
+            if get_origin(choice) is Annotated:
+                metas += notes_of(choice)
+    return metas + [note for note in notes if isinstance(note, Meta)]
 
 
 def is_optional(kind: Any) -> bool:

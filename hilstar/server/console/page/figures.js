@@ -36,6 +36,7 @@ const FORMS = {
   share: (value, unit, digits) => number(100 * value, unit, digits),
   signed: signedAll,
   text: (value) => value,
+  clause: (value) => value.split(": ")[0], // the whole of it stands under Events
   clock: (synchronised) => (synchronised ? "time exchange" : "arrivals (excludes the minimum delay)"),
   reasons: (counts) => Object.entries(counts).map(([reason, n]) => `${n} ${reason}`).join(", "),
   clipped: (stars) => stars.length && `${stars.length}: ${stars.slice(0, MOST_NAMED).map(starName).join(", ")}${stars.length > MOST_NAMED ? ", \u2026" : ""}`,

@@ -11,7 +11,7 @@ export const STAR = {"x_px": 0, "y_px": 1, "v_mag": 2, "hip": 3, "label": 4, "cl
 export const FIGURES = [
   {"panel": "pointing", "name": "Rate x, y, z", "key": "attitude.rate_deg_s", "unit": "\u00b0/s", "digits": 3, "form": "signed", "text": "{}", "none": "\u2013", "shade": ""},
   {"panel": "pointing", "name": "Quaternion", "key": "attitude.q", "unit": "", "digits": 5, "form": "signed", "text": "{}", "none": "\u2013", "shade": ""},
-  {"panel": "source", "name": "First attitude", "key": "pointing", "unit": "", "digits": 0, "form": "text", "text": "{}", "none": "\u2013", "shade": ""},
+  {"panel": "source", "name": "First attitude", "key": "pointing", "unit": "", "digits": 0, "form": "clause", "text": "{}", "none": "\u2013", "shade": ""},
   {"panel": "source", "name": "Age at light", "key": "attitude.age_ms", "unit": "ms", "digits": 1, "form": "number", "text": "{}", "none": "\u2013", "shade": ""},
   {"panel": "source", "name": "Source", "key": "source.kind", "unit": "", "digits": 0, "form": "text", "text": "{}  {source.endpoint}", "none": "\u2013", "shade": ""},
   {"panel": "source", "name": "Clock offset", "key": "clock.offset_ms", "unit": "ms", "digits": 3, "form": "number", "text": "{} \u00b1 {clock.sigma_ms}", "none": "\u2013", "shade": ""},

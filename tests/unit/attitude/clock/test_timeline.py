@@ -75,6 +75,12 @@ def test_prediction_without_a_rate_uses_the_last_two_samples():
     assert error_rad(timeline, 60, 60) < EXACT_RAD
 
 
+def test_two_samples_around_a_silence_do_not_tell_a_rate_to_predict_with():
+    """Over more than stale_after_ms the camera may have turned any way."""
+    assert error_rad(filled(sample(0), sample(250)), 300, 300) < EXACT_RAD
+    assert error_rad(filled(sample(0), sample(251)), 300, 251) < EXACT_RAD
+
+
 def test_a_lone_sample_without_a_rate_is_held():
     assert error_rad(filled(sample(0)), 60, 0) < EXACT_RAD
 

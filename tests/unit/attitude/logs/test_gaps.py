@@ -14,7 +14,7 @@ from hilstar.attitude.logs.entries import GAP_INTERVALS, log_joins
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate, to_matrix
-from hilstar.instruments.simulate.batch import log_views
+from hilstar.instruments.simulate.exposures import log_views
 from hilstar.server.send_log import log_samples
 
 S = 1_000_000_000

@@ -152,6 +152,17 @@ def test_a_line_that_never_sent_holds_for_as_long_and_no_longer():
             wait_for(lambda: taken(link) == b"e", "the tracker's bytes")
 
 
+def test_the_kernel_asks_a_tracker_that_says_nothing_whether_it_is_there():
+    """A cable that was pulled ends the connection in seconds, and not in two hours."""
+    clock = FakeClock()
+    with listening(clock, Notices()) as (link, port), hold(link, port, clock):
+        option = link._connection.getsockopt
+        assert option(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        tcp = [socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT]
+        idle_s, interval_s, count = [option(socket.IPPROTO_TCP, name) for name in tcp]
+        assert idle_s + interval_s * count <= 6
+
+
 def replaced(path: Path, kind: str) -> None:
     path.unlink(missing_ok=True)
     if kind == "a device":

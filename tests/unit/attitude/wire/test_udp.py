@@ -9,16 +9,14 @@ import socket
 import pytest
 
 from hilstar.attitude.wire.endpoint import MAX_KNOWN, AllowedSenders, bound_place
+from hilstar.attitude.wire.kernel_stamps import SO_TIMESTAMPNS, TIMESPEC, KernelStamps
 from hilstar.attitude.wire.packet import Status, TimeReply, TimeRequest, encode
 from hilstar.attitude.wire.udp import (
     MAX_CREDIT_BYTES,
     MAX_PEERS,
     MAX_STRANGERS,
-    SO_TIMESTAMPNS,
-    TIMESPEC,
     Credit,
     Datagrams,
-    KernelStamps,
     UdpLink,
 )
 from hilstar.basics.notices import Notices

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from PIL import Image
 
+from hilstar.basics.fits_headers import read_fits_image
+from hilstar.instruments.calibrate.first_light.image_sources import GrabCamera
 from hilstar.instruments.confront import page
 from hilstar.instruments.confront.images import read_photographs
+from hilstar.instruments.confront.measured_bench import read_tracker_file
 from hilstar.server.genicam.camera import has_aravis
 from hilstar.server.gige.registers import CameraSettings
 from tests.support.commands import run_hilstar_here
@@ -87,6 +91,19 @@ def test_a_camera_that_sees_no_stars_is_told_in_one_line(tmp_path):
         )
     assert done.returncode == 2
     assert "hilstar: " in done.stderr.splitlines()[-1]
+
+
+@needs_aravis
+def test_a_mosaic_is_written_as_the_camera_names_it(tmp_path):
+    bench = write_bench(tmp_path / "guess.toml")
+    text = bench.read_text().replace(f"[{WIDTH}, {HEIGHT}]", "[512, 512]")
+    bench.write_text(f'{text}\n[tracker.camera]\npixel_format = "BayerGR8"\n')
+    with (
+        fake_camera() as address,
+        closing(GrabCamera(read_tracker_file(bench)[0], address)) as source,
+    ):
+        path = source.photograph(tmp_path / "mosaic", 0.01)
+    assert read_fits_image(path.read_bytes()).bayer == "GRBG"
 
 
 @pytest.mark.parametrize(

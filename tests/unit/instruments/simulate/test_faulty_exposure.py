@@ -12,7 +12,7 @@ import hilstar
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import angle_between_rad
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.instruments.simulate.batch import faulty_exposure
+from hilstar.instruments.simulate.exposures import faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.layers.fault_kinds import Now

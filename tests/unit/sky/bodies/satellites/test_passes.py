@@ -102,6 +102,16 @@ def test_the_observer_itself_is_not_drawn_and_a_line_says_so(caplog):
     assert len(satellite_sky(docked, Geocentre()).passing(EVERYWHERE, t_ns)) == 1
 
 
+def test_the_observer_s_own_number_is_not_drawn_by_elements_that_place_it_elsewhere(caplog):
+    """A list's elements may be weeks older than the bench's: 300 km along the orbit."""
+    elsewhere = (51.6416, 247.4627, 130.5360, 325.0288 + 3.0)
+    sets = (element_set(number, elsewhere, 0.0006703, 15.72125391) for number in (25544, 7))
+    seen = satellite_sky("".join(sets)).passing(EVERYWHERE, 55 * 60 * S_NS)
+    assert seen is not None
+    assert seen.index.tolist() == [1]
+    assert "is the observer itself" in caplog.text
+
+
 def test_decayed_satellites_are_left_out_with_one_line_and_the_others_stay(rng, caplog):
     """Ones that cannot be, a mean motion of 18 turns a day, among good ones."""
     bad = "".join(

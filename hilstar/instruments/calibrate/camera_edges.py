@@ -1,0 +1,165 @@
+"""A camera in the place of a photodiode: when the display's square changed, from images of it.
+
+A frame's level is the share of its exposure in which the square was lit, so that a change within an
+exposure is known better than the exposure is long. One between two exposures is taken to be in the
+middle between them.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from hilstar.attitude.clock.sender_clock import OneWayFilter
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
+from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.instruments.calibrate.latency import MIN_EDGES, Edges
+from hilstar.server.genicam.camera import Film, GenicamCamera
+from hilstar.server.genicam.pixels import FORMAT
+
+LOOK_S, CHUNK_S = 1.0, 4.0
+# of a refresh: as many exposures lie within one as tell its level and both its ends
+EXPOSURE_REFRESHES = 0.2
+HALF = 0.5  # of the largest change of a pixel: the square's pixels change by more
+MIN_CHANGE_DN, NOISE_TIMES = 8.0, 4.0
+DARK, LIT = 0.1, 0.9  # shares of an exposure: between them the square changed in it
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """Where a camera sees the display's square: its rows (first, after the last), and which pixels
+    (rows, columns) of them it is.
+    """
+
+    rows: tuple[int, int]
+    pixels: BoolArray
+
+
+def film_edges(
+    camera: GenicamCamera, seconds: float, exposure_s: float | None, refresh_hz: float
+) -> Edges:
+    """When the square changed within `seconds`, host time, by a camera that sees it.
+
+    The camera's own delay, from the end of an exposure to its first byte here, stays in the times.
+    Raises InputError where nothing blinks or the camera is too slow, MachineError.
+    """
+    formats = [name for name in camera.about["formats"] if _is_plain(name)]
+    if not formats:
+        raise InputError(
+            "the camera has no format of whole bytes of grey or Bayer:"
+            f" {', '.join(camera.about['formats'])}"
+        )
+    camera.set({"PixelFormat": min(formats, key=_bits_of)})
+    if exposure_s is None:
+        exposure_s = EXPOSURE_REFRESHES / refresh_hz
+    square = find_square(camera.film(exposure_s, LOOK_S))
+    edges: list[Edges] = []
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0:
+        to_host_ns = time.monotonic_ns() - time.time_ns()
+        film = camera.film(exposure_s, min(left_s, CHUNK_S), square.rows)
+        begin_ns = begin_on_host(film, to_host_ns)
+        check_rate(begin_ns, film.exposure_s, refresh_hz)
+        levels = film.dn[:, square.pixels].mean(axis=1)
+        edges.append(edges_in(begin_ns, film.exposure_s, levels))
+    host_ns = np.concatenate([part.host_ns for part in edges])
+    if len(host_ns) < MIN_EDGES:
+        raise InputError(
+            f"{len(host_ns)} changes of the square came, and at least {MIN_EDGES} are needed; write"
+            " a longer --duration"
+        )
+    return Edges(host_ns, np.concatenate([part.level for part in edges]))
+
+
+def _is_plain(name: str) -> bool:
+    match = FORMAT.fullmatch(name)
+    return match is not None and match[3] is None
+
+
+def _bits_of(name: str) -> int:
+    match = FORMAT.fullmatch(name)
+    assert match is not None
+    return int(match[2])
+
+
+def find_square(film: Film) -> Square:
+    """The largest patch of pixels that change the most. Raises InputError where nothing does."""
+    low = np.full(film.dn.shape[1:], np.inf)
+    high = np.full(film.dn.shape[1:], -np.inf)
+    for image in film.dn:
+        np.minimum(low, image, out=low)
+        np.maximum(high, image, out=high)
+    change = high - low
+    largest = float(np.quantile(change, 1 - 20 / max(change.size, 21)))
+    if largest < max(MIN_CHANGE_DN, NOISE_TIMES * float(np.median(change))):
+        raise InputError(
+            f"nothing blinks in the camera's images: pixels change by {largest:.0f} DN at most;"
+            " point it at the square ([monitor] photodiode_px), while serve runs"
+        )
+    patches, count = ndimage.label(change > HALF * largest)
+    sizes = np.bincount(patches.ravel(), minlength=count + 1)[1:]
+    is_square = patches == 1 + int(sizes.argmax())
+    rows = np.flatnonzero(is_square.any(axis=1))
+    first, last = int(rows[0]), int(rows[-1]) + 1
+    return Square((first, last), is_square[first:last])
+
+
+def begin_on_host(film: Film, to_host_ns: int) -> IntArray:
+    """When each exposure began (n,), host time: an exposure before its first byte came.
+
+    The camera's clock says how far apart they are; of its offset the smallest counts, as some bytes
+    wait. `to_host_ns` is the host's monotonic time less its UTC.
+    """
+    exposure_ns = round(film.exposure_s * NS_PER_S)
+    ended_ns = film.arrived_utc_ns + to_host_ns
+    if len(film.stamp_ns) > 1 and not (np.diff(film.stamp_ns) > 0).all():
+        return ended_ns - exposure_ns  # a camera without a clock
+    clock = OneWayFilter()
+    for arrival_ns, stamp_ns in zip(ended_ns.tolist(), film.stamp_ns.tolist(), strict=True):
+        clock.observe(arrival_ns, arrival_ns - stamp_ns)
+    assert clock.line is not None
+    offset_ns = [round(clock.line.at(arrival_ns)) for arrival_ns in ended_ns.tolist()]
+    return film.stamp_ns + np.array(offset_ns, dtype=np.int64) - exposure_ns
+
+
+def check_rate(begin_ns: IntArray, exposure_s: float, refresh_hz: float) -> None:
+    """Refuse (InputError) exposures of which none lies within one refresh for sure."""
+    period_s = float(np.median(np.diff(begin_ns))) / NS_PER_S if len(begin_ns) > 1 else np.inf
+    if period_s + exposure_s > 1 / refresh_hz:
+        exposure_ms, period_ms, refresh_ms = (
+            seconds * NS_PER_S / NS_PER_MS for seconds in (exposure_s, period_s, 1 / refresh_hz)
+        )
+        raise InputError(
+            f"the camera exposes for {exposure_ms:.3g} ms every {period_ms:.3g} ms, and the square"
+            f" may change every {refresh_ms:.3g} ms; write a shorter --exposure, or a higher"
+            " AcquisitionFrameRate or a smaller Height in [tracker.camera] features"
+        )
+
+
+def edges_in(begin_ns: IntArray, exposure_s: float, levels: FloatArray) -> Edges:
+    """The changes of a light that is on or off, by exposures that begin at `begin_ns` (n,) and
+    their signals (n,).
+    """
+    middle = (levels.min() + levels.max()) / 2
+    dark, lit = (float(np.median(levels[part])) for part in (levels <= middle, levels >= middle))
+    share = np.clip((levels - dark) / max(lit - dark, 1e-9), 0.0, 1.0)
+    exposure_ns = exposure_s * NS_PER_S
+    sure = np.flatnonzero((share < DARK) | (share > LIT))
+    is_lit = share[sure] > HALF
+    edges: list[tuple[float, int]] = []
+    for k in np.flatnonzero(np.diff(is_lit)):
+        before, after = int(sure[k]), int(sure[k + 1])
+        level = int(is_lit[k + 1])
+        if after == before + 1:
+            edge_ns = (float(begin_ns[before]) + exposure_ns + float(begin_ns[after])) / 2
+        elif after == before + 2:
+            # the light had its old level until then
+            old = share[before + 1] if level == 0 else 1 - share[before + 1]
+            edge_ns = float(begin_ns[before + 1]) + old * exposure_ns
+        else:
+            continue  # the light changed more than once, or images are missing
+        edges.append((edge_ns, level))
+    host_ns = np.array([round(edge_ns) for edge_ns, _ in edges], dtype=np.int64)
+    return Edges(host_ns, np.array([level for _, level in edges], dtype=np.int64))

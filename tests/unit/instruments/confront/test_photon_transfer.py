@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.confront.background import NO_PATTERN, fixed_pattern, sky_level
-from hilstar.instruments.confront.photon_transfer import fit_pixels, transfer_points
+from hilstar.instruments.confront.photon_transfer import (
+    _median_error,
+    fit_pixels,
+    transfer_points,
+)
 from hilstar.tracker.settings import DetectorSettings
 
 GAIN, PRNU, READ_E = 17.0, 0.03, 2.0  # the Rosetta NAVCAM of the thesis
@@ -105,3 +109,10 @@ def test_read_noise_is_what_variance_is_left_of_no_light_but_for_the_codes_own(r
     assert pixels.gain_told
     assert pixels.gain_e_per_dn == pytest.approx(gain, rel=1e-3)
     assert pixels.read_noise_e == pytest.approx(read_e, rel=0.01)
+
+
+def test_a_median_s_stated_error_is_the_scatter_of_medians(rng):
+    draws = rng.normal(0.0, 2.0, (2000, 101))
+    stated = np.mean([_median_error(draw) for draw in draws[:200]])
+    # 2000 medians tell their scatter to 1.6 %; the law is of many values
+    assert stated == pytest.approx(np.median(draws, axis=1).std(), rel=0.08)

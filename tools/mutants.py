@@ -37,7 +37,7 @@ ROOMS = ("sky", "optics", "display", "attitude", "tracker", "server/loop.py")
 MAX_RUN_S = 1800
 HANGS = "it does not end"
 # a test that takes longer waits for what never comes, and ends the run (pytest 9.0 or newer)
-STUCK_S = 120
+STUCK_S = 60
 # tests of one mutant that fail for other reasons, before its outcome is "none found"
 MAX_PASSED_OVER = 5
 STUCK_ENDS = (

@@ -36,6 +36,13 @@ def told(*arguments: object) -> dict:
     return json.loads(result.stdout)
 
 
+def test_an_attitude_of_a_log_s_gap_is_said_to_be_held(tmp_path, small_bench_file):
+    q = [0.5, 0.5, -0.5, 0.5]
+    log = log_of(tmp_path, [(t_s, q) for t_s in (0.0, 1.0, 2.0, 3.0, 60.0, 61.0)])
+    between, in_gap = (told(log, "--time", t_s, "--bench", small_bench_file) for t_s in (1.5, 30))
+    assert (between["held"], in_gap["held"]) == (False, True)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(
     tmp_path, small_bench_file, seed

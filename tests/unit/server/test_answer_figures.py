@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.server.record.answer_figures import AnswerTally
 from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord
 from hilstar.server.record.run_figures import figures_of, summarise
 from tests.support.commands import run_hilstar_here
@@ -112,3 +113,59 @@ def test_the_reports_page_and_text_have_the_answers(ledger, tmp_path):
         and "first wrong after 2.0" in text
         and "tracker's availability" in text
     )
+
+
+def tallied(verdicts: str, residuals=None, faults=()) -> AnswerTally:
+    """Answers every CYCLE_S by the first letters of their verdicts, and faults from and to, s."""
+    tally = AnswerTally()
+    names = {"r": "right", "w": "wrong", "u": "unpaired"}
+    events = [(k * CYCLE_S, letter, k) for k, letter in enumerate(verdicts)]
+    for begin_s, end_s in faults:
+        events += [(begin_s, "start", 0), (end_s, "end", 0)]
+    for t_s, what, k in sorted(events):
+        at_ns = START_NS + round(t_s * NS_PER_S)
+        if what in names:
+            residual = None if residuals is None else tuple(residuals[k])
+            tally.answer(
+                AnswerRecord(
+                    host_ns=at_ns,
+                    raw="01",
+                    middle_ns=at_ns,
+                    verdict=names[what],
+                    residual_arcsec=residual,
+                )
+            )
+        else:
+            tally.fault(
+                FaultRecord(
+                    host_ns=at_ns,
+                    event=what,
+                    number=1,
+                    name="glint",
+                    kind="stray",
+                    who="file",
+                    t_ns=0,
+                    table="",
+                )
+            )
+    return tally
+
+
+def test_a_fault_that_the_tracker_bears_is_recovered_from_at_its_end():
+    """The next right answer comes up to a cycle later: that is no time to recover."""
+    borne = tallied("r" * 60, faults=[(2.0, 3.97)]).report(START_NS)
+    assert borne.faults[0].recovered_s == 0.0
+    late = tallied("r" * 35 + "w" * 10 + "r" * 15, faults=[(2.0, 3.97)]).report(START_NS)
+    assert late.faults[0].recovered_s == pytest.approx(4.5 - 3.97)
+
+
+def test_three_sigma_is_that_of_a_sample():
+    residuals = np.random.default_rng(3).normal(1.0, 2.0, (4, 3))
+    found = tallied("rrrr", residuals).report(START_NS)
+    assert found.sigma3_arcsec == pytest.approx(3 * residuals.std(axis=0, ddof=1), abs=2e-3)
+    assert found.rms_arcsec == pytest.approx(np.sqrt((residuals**2).mean(axis=0)), abs=2e-3)
+
+
+def test_answers_of_no_sky_are_not_due():
+    found = tallied("rrrruurrrw").report(START_NS)
+    assert found.availability == pytest.approx(7 / 8)

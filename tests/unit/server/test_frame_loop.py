@@ -13,8 +13,8 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.optics.layers.view import View
-from hilstar.server.bench.config import parse_config
-from hilstar.server.loop import FrameLoop, Limit
+from hilstar.server.bench.config import AttitudeSettings, parse_config
+from hilstar.server.loop import FrameLoop, Limit, policy_of
 from hilstar.server.pacer import Moment, Pacer, Shown
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
@@ -248,3 +248,12 @@ def test_a_frame_that_is_given_up_has_no_start_on_a_screen(tmp_path):
     due_ns = clock.now_ns()
     assert loop.draw(0, 0, STILL, Moment(0, due_ns, due_ns, swap_ns=due_ns)) is None
     assert started == []
+
+
+def test_the_timeline_s_policy_is_the_bench_file_s_in_nanoseconds_and_radians():
+    policy = policy_of(
+        AttitudeSettings(max_extrapolation_ms=80.0, stale_after_ms=250.0, max_rate_deg_s=90.0)
+    )
+    assert policy.max_extrapolation_ns == 80_000_000
+    assert policy.stale_after_ns == 250_000_000
+    assert policy.max_rate_rad_s == pytest.approx(math.pi / 2)

@@ -129,3 +129,12 @@ def test_without_the_extra_it_says_how_to_get_it(sky, monkeypatch):
         InputError, match=r"pip install \"hilstar\[solve\]\", or write --solver truth"
     ):
         LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))
+
+
+def test_two_stars_tell_a_rotation_and_never_its_mirror(rng):
+    """Of two directions the third singular value is 0, and its sign is anyone's guess."""
+    for _ in range(40):
+        q = normalise(rng.normal(size=4))
+        known = normalise(rng.normal(size=(2, 3)))
+        found = wahba(known @ to_matrix(q).T, known, np.array([1.0, 2.0]))
+        assert angle_between_rad(found, q) < 1e-7

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.latency import Edges, pair
+from hilstar.instruments.calibrate import latency
+from hilstar.instruments.calibrate.latency import Edges, Paired, pair, summarise
+from hilstar.server.bench.config import parse_config
 from hilstar.server.screen.screen import marker_light
+from tests.support.benches import SMALL_BENCH
 
 PERIOD_NS = 1e9 / 60
 
@@ -38,3 +41,30 @@ def test_edges_of_another_run_are_refused(rng):
     seen = Edges(np.sort(rng.integers(0, swap_ns[-1], 200)), rng.integers(0, 2, 200))
     with pytest.raises(InputError, match="edges fit"):
         pair(seen, shown_edges, PERIOD_NS / 4)
+
+
+def test_a_panel_s_delay_is_the_median_less_the_way_of_the_scan_to_the_square(tmp_path):
+    """Of edges that rise after 20 ms and fall after 23 ms."""
+    config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
+    level = np.array([1, 0, 1, 0, 1])
+    paired = Paired(np.where(level, 20e6, 23e6), level, unmatched=0, ambiguous=False)
+    found = summarise(paired, config)
+    assert (found["rise_ms"], found["fall_ms"]) == (20.0, 23.0)
+    assert found["latency_ms"]["p50"] == 20.0
+    to_square_ms = found["swap_to_square_ms"]
+    assert to_square_ms == pytest.approx(1e3 / config.monitor.refresh_hz)  # the usual scan-out
+    assert found["panel_delay_ms"] == pytest.approx(20.0 - to_square_ms)
+
+
+def test_a_device_s_own_times_are_microseconds(monkeypatch):
+    """Edges that a slow line brings late stand where the device saw them."""
+    true_ns = 10**9 + np.arange(40) * 50_000_000
+    late_ns = np.resize([1_000_000, 9_000_000, 4_000_000], 40)
+    lines = [
+        (int(at + late), f"{k % 2},{at // 1000}".encode())
+        for k, (at, late) in enumerate(zip(true_ns, late_ns, strict=True))
+    ]
+    monkeypatch.setattr(latency, "read_lines", lambda *_: lines)
+    edges = latency.capture_edges("/dev/none", 115200, 2.0)
+    np.testing.assert_allclose(edges.host_ns - true_ns, 1_000_000, atol=100_000)
+    assert edges.level.tolist() == [0, 1] * 20

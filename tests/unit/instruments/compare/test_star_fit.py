@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.instruments.compare.star_fit import StarTemplates
+from hilstar.display.render.reference import linear_image
+from hilstar.instruments.compare.star_fit import StarTemplates, describes
+from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import pack_sprites
 
 SIZE_PX = 40, 30
 ROUNDING = 1e-14  # of sums of some hundred float64 products, all below 1
@@ -26,3 +29,19 @@ def test_normal_matrix_and_fit_are_those_of_the_columns(rng):
     dense = np.stack([alone.image(unit).ravel() for unit in np.eye(6)], axis=1)
     wanted = np.linalg.lstsq(dense, image, rcond=None)[0].reshape(2, 3)
     assert np.allclose(alone.fit(image.reshape(30, 40)), wanted, rtol=1e-10)
+
+
+def test_a_table_of_stars_a_few_pixels_away_is_that_of_another_sky(rng):
+    """A blend's distance decides, not the image's size."""
+    size_px = 200, 150
+    psf = GaussianPsf((0.85, 0.85))
+    grid = np.arange(15, 200, 24.0), np.arange(15, 150, 24.0)
+    x, y = (part.ravel() + rng.uniform(-0.4, 0.4, part.size) for part in np.meshgrid(*grid))
+    flux = np.full(len(x), 1e4)
+    sprites = pack_sprites(x, y, flux, np.arange(len(x)), size_px, psf.footprint_px)
+    image = linear_image(sprites, size_px, psf)
+    table = np.zeros(len(x), dtype=TRUTH_DTYPE)
+    table["x_px"], table["y_px"], table["electrons_per_s"] = x, y, flux
+    assert describes(table, image)
+    table["x_px"] += 12.0
+    assert not describes(table, image)

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.confront.background import NO_PATTERN, fixed_pattern, sky_level
-from hilstar.instruments.confront.photon_transfer import fit_pixels, transfer_points
+from hilstar.instruments.confront.photon_transfer import (
+    _median_error,
+    fit_pixels,
+    transfer_points,
+)
 from hilstar.tracker.settings import DetectorSettings
 
 GAIN, PRNU, READ_E = 17.0, 0.03, 2.0  # the Rosetta NAVCAM of the thesis
@@ -92,3 +96,23 @@ def test_a_gain_too_small_for_the_noise_is_named_with_the_least_that_is_possible
     assert pixels.gain_e_per_dn == 5
     assert any("write [tracker.detector] gain_e_per_dn = 1" in note for note in pixels.notes)
     assert pixels.pattern.rms[0] == 0
+
+
+def test_read_noise_is_what_variance_is_left_of_no_light_but_for_the_codes_own(rng):
+    """A code's step adds 1/12 DN^2, a quarter of what a quiet sensor's electronics add."""
+    gain, read_e = 2.0, 1.2
+    level_dn = np.linspace(5.0, 200.0, 400)
+    true_dn2 = level_dn / gain + (read_e / gain) ** 2 + 1 / 12
+    points = np.column_stack([level_dn, true_dn2 * rng.normal(1.0, 1e-4, len(level_dn))])
+    bench = DetectorSettings(gain_e_per_dn=gain, read_noise_e=10.0)
+    pixels = fit_pixels(points, 1.0, None, bench, NO_PATTERN)
+    assert pixels.gain_told
+    assert pixels.gain_e_per_dn == pytest.approx(gain, rel=1e-3)
+    assert pixels.read_noise_e == pytest.approx(read_e, rel=0.01)
+
+
+def test_a_median_s_stated_error_is_the_scatter_of_medians(rng):
+    draws = rng.normal(0.0, 2.0, (2000, 101))
+    stated = np.mean([_median_error(draw) for draw in draws[:200]])
+    # 2000 medians tell their scatter to 1.6 %; the law is of many values
+    assert stated == pytest.approx(np.median(draws, axis=1).std(), rel=0.08)

@@ -191,6 +191,33 @@ def test_a_silent_tracker_is_told_before_its_first_answer():
     assert judge.figures(4 * NS_PER_S, {}).silent == "the tracker has not answered yet"
 
 
+def judged_at_rest(errors_arcsec, cycle_ns: int) -> AnswerJudge:
+    """Answers of a tracker that looks at a still sky, each off by (3,), arcsec, one a cycle."""
+    frames = LitFrames(PERIOD_NS)
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for k, error in enumerate(errors_arcsec):
+        q = multiply(from_rotation_vector(np.asarray(error) / ARCSEC_PER_RAD), START)
+        judge.judge(Answer(NS_PER_S + k * cycle_ns, b"", NS_PER_S, q))
+    return judge
+
+
+def test_rms_is_about_zero_and_three_sigma_about_the_mean():
+    errors = np.random.default_rng(2).normal([5.0, -3.0, 20.0], [1.0, 2.0, 8.0], (12, 3))
+    figures = judged_at_rest(errors, 1_000_000).figures(2 * NS_PER_S, {})
+    assert figures.mean_arcsec == pytest.approx(errors.mean(axis=0), abs=2e-3)
+    assert figures.rms_arcsec == pytest.approx(np.sqrt((errors**2).mean(axis=0)), abs=2e-3)
+    assert figures.sigma3_arcsec == pytest.approx(3 * errors.std(axis=0, ddof=1), abs=4e-3)
+
+
+def test_a_slow_tracker_is_silent_after_five_of_its_own_cycles():
+    judge = judged_at_rest(np.zeros((10, 3)), NS_PER_S)
+    last_ns = 10 * NS_PER_S
+    assert judge.figures(round(last_ns + 4.9 * NS_PER_S), {}).silent == ""
+    assert "has not answered for 5.1 s" in judge.figures(round(last_ns + 5.1 * NS_PER_S), {}).silent
+
+
 def test_of_more_answers_than_it_keeps_the_newest_count(monkeypatch):
     monkeypatch.setattr(judge_module, "MAX_IN_WINDOW", 100)
     frames = LitFrames(PERIOD_NS)

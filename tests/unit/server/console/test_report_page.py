@@ -18,6 +18,7 @@ from hilstar.server.record.run_figures import (
     MAX_EVENTS,
     RunFigures,
     SpanTable,
+    ThinnedRows,
     TimeBins,
     summarise,
 )
@@ -213,6 +214,18 @@ def test_lost_packets_are_a_figure_of_their_own():
     assert (
         found.lost_packets == 3 and "lost" not in found.packets and "sequence" not in found.packets
     )
+
+
+def test_thinned_rows_are_evenly_spaced_over_the_whole_stream(rng):
+    for count in (1, 16, 17, 1000, 4097):
+        rows = ThinnedRows(1, capacity=16)
+        at = 0
+        while at < count:
+            end = min(count, at + int(rng.integers(1, 40)))
+            rows.add(np.arange(at, end, dtype=float)[:, None])
+            at = end
+        assert rows.rows[:, 0].tolist() == list(range(0, count, rows.stride))
+        assert len(rows.rows) <= 16
 
 
 def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():

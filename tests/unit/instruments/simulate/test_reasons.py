@@ -1,0 +1,69 @@
+"""The reasons of a verdict name what is off, in the unit that they state."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from hilstar.instruments.simulate import budget
+from hilstar.instruments.verify.verdict import _black, _geometry
+
+LIMIT_PX = 0.1
+RIGHT = {
+    "left": 0.0,
+    "scale_error": 0.0,
+    "rotation_rad": 0.0,
+    "offset_px": (0.0, 0.0),
+    "tilt_px": 0.0,
+    "distortion_px": 0.0,
+    "left_px": 0.0,
+}
+
+
+def geometry_reasons(**off: object) -> list[str]:
+    measured = SimpleNamespace(
+        config=SimpleNamespace(
+            verify=SimpleNamespace(centroid_px=LIMIT_PX), collimator=SimpleNamespace(geometry="")
+        ),
+        camera=SimpleNamespace(resolution_px=(600, 800)),
+    )
+    return _geometry(measured, SimpleNamespace(geometry=SimpleNamespace(**RIGHT | off)))
+
+
+def test_a_turned_field_is_told_in_degrees_from_where_a_corner_is_off_by_the_limit():
+    """A corner is 500 px from the middle."""
+    assert geometry_reasons(rotation_rad=0.99 * LIMIT_PX / 500) == []
+    (turned,) = geometry_reasons(rotation_rad=math.radians(-0.25))
+    assert "turned by -0.250 deg" in turned
+
+
+def test_a_wrong_scale_is_told_in_per_cent_from_where_a_corner_is_off_by_the_limit():
+    assert geometry_reasons(scale_error=0.99 * LIMIT_PX / 500) == []
+    (scaled,) = geometry_reasons(scale_error=-0.0123)
+    assert "scale is -1.23% off" in scaled
+
+
+@pytest.mark.parametrize("seen", [4.0, 6.0])
+def test_a_black_level_is_wrong_on_either_side(seen):
+    glow = SimpleNamespace(seen_e_per_s_px=seen, assumed_e_per_s_px=5.0, limit_e_per_s_px=0.9)
+    (reason,) = _black(SimpleNamespace(glow=glow))
+    assert "calibrate the black level" in reason
+    glow.limit_e_per_s_px = 1.1
+    assert _black(SimpleNamespace(glow=glow)) == []
+
+
+def test_a_budget_s_arcseconds_are_those_where_a_pixel_is_widest():
+    """Of a lens that has 1000 to 1300 px to a radian: 0.01 px are up to 2.06 arcsec."""
+    errors = SimpleNamespace(
+        flux_rms_mag=0.0,
+        flux_max_mag=0.0,
+        max_px=lambda kind: 0.01,
+        axis_rms_px=lambda kind: 0.005,
+    )
+    bench = SimpleNamespace(camera=SimpleNamespace(scales_px_rad=lambda: (1000.0, 1300.0)))
+    row = budget._row(bench, 1.0, errors, "moment", 3.0)
+    assert row.centroid_max_arcsec == pytest.approx(206264.8 * 0.01 / 1000, rel=1e-5)
+    assert row.centroid_rms_px == pytest.approx(math.sqrt(2) * 0.005)
+    assert row.v_mag == 4.0

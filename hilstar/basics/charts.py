@@ -183,7 +183,7 @@ def finish(figure: "Figure") -> None:
     side_names = _SIDE_NAMES.pop(figure, [])
     for axes in panels:
         axes.set_title(capital(axes.get_title(loc="left")))
-        # Matplotlib fits ticks into an axis by the style of now, unless the axis has its own size: a
+        # Matplotlib fits ticks into an axis by the style of now, unless it has its own size: a
         # figure that is written outside the style would have others than it was laid out with.
         axes.tick_params(labelsize=SMALL_PT)
     every: list[Any] = [axis for axes in panels for axis in (axes.xaxis, axes.yaxis)]

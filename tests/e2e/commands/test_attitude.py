@@ -103,8 +103,12 @@ def test_a_live_stream_is_awaited(tmp_path):
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port), talking(sender, q=(0.5, 0.5, -0.5, 0.5)):
         bench.write_text(SMALL_BENCH + attitude_table(port))
-        found = told(bench)
+        other = tmp_path / "other.toml"
+        other.write_text(SMALL_BENCH)
+        found = told(bench, "--bench", other)
     assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((0, 0), abs=ROUNDING_DEG)
+    # whose stars are told
+    assert found["tracker"]["file"] == "other.toml"
 
 
 def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):

@@ -14,8 +14,9 @@ import pytest
 import zmq
 
 from hilstar.basics.rotation import from_radec_roll_deg
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH, attitude_table
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.ledgers import read_run
 from tests.support.senders import (
     await_subscriber,
     connected,
@@ -221,7 +222,11 @@ def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
 
 
 def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
-    with publisher() as (sender, port), serving(tmp_path, port) as process:
+    ledger = tmp_path / "run.mcap"
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, "--ledger", ledger) as process,
+    ):
         assert process.stderr is not None
         for start_ns in (10**15, 0):  # the clock of the second run restarts
             for k in range(50):
@@ -239,6 +244,19 @@ def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
         packets = summary_of(process)["packets"]
     assert packets["refused"] == 0
     assert packets["accepted"] == 100
+    # frames are dated by the sender's clock as it is now
+    assert read_run(ledger).frames[-1].light_ns < 10**13
+
+
+def test_a_run_of_a_stated_time_ends_by_itself_and_without_an_attitude_with_code_4(tmp_path):
+    """Half a second of 60 Hz are 30 frames, shown or missed."""
+    bench = tmp_path / "bench.toml"
+    bench.write_text(SMALL_BENCH + attitude_table(free_port()))
+    result = run_hilstar_here("serve", bench, "--headless", "--duration", "0.5", "--json")
+    assert result.returncode == 4
+    summary = json.loads(result.stdout)
+    assert summary["blank_frames"] == summary["frames"] > 0
+    assert summary["frames"] + summary["missed_frames"] <= 30
 
 
 def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):

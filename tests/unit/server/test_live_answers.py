@@ -11,6 +11,7 @@ import numpy as np
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_S
+from hilstar.server import serve
 from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.answers.judge import AnswerRules
 from hilstar.server.live_answers import MAX_JUDGED_HZ, LiveAnswers
@@ -179,3 +180,18 @@ def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
         source.unread = ""
         wait_for(lambda: told("the tracker has not answered"))
     assert notices.counts() == {"answers-unread": 1, "answers-read": 1, "tracker-silent": 1}
+
+
+def test_an_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
+    """A sender whose clock is 7 s behind the host's."""
+    sent = []
+    receiver = SimpleNamespace(
+        clock_summary=lambda: SimpleNamespace(offset_ms=7000.0),
+        back=SimpleNamespace(pass_on=sent.append),
+    )
+    answer = Answer(20 * NS_PER_S, b"", None, np.array([1.0, 0.0, 0.0, 0.0]))
+    serve._pass_on(receiver, iter([5]), answer, 12 * NS_PER_S)
+    assert [(each.sequence, each.t_ns) for each in sent] == [(5, 5 * NS_PER_S)]
+    receiver.clock_summary = lambda: SimpleNamespace(offset_ms=None)
+    serve._pass_on(receiver, iter([6]), answer, 12 * NS_PER_S)
+    assert len(sent) == 1

@@ -11,8 +11,8 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
-from hilstar.server.watchdog import AttitudeWatch, FrameWatch
-from tests.support.fake_clock import FakeClock
+from hilstar.server.watchdog import AttitudeWatch, FrameWatch, GpuWatch
+from tests.support.fake_clock import FakeClock, WellGpu
 from tests.support.waiting import PATIENCE_S
 
 PERIOD_NS = 16_666_667
@@ -94,3 +94,45 @@ def test_a_frame_that_hangs_is_told_once_with_its_stage_while_it_hangs():
         clock.work(2e9)
         assert told.wait(PATIENCE_S)
     assert lines == ["frame 7 hangs in its stage swap since 2.0 s"]
+
+
+class SleepingClock(FakeClock):
+    """Of a machine that has slept for `asleep` ns in all."""
+
+    asleep = 0
+
+    def asleep_ns(self) -> int:
+        return self.asleep
+
+
+class WokenGpu(WellGpu):
+    """Counts how often its images are forgotten; `changed` of its tables are not as they were."""
+
+    forgotten = changed = 0
+
+    def changed_tables(self) -> int:
+        return self.changed
+
+    def forget_images(self) -> None:
+        self.forgotten += 1
+
+
+def test_after_a_sleep_the_next_frame_is_drawn_on_black_and_lost_tables_end_the_run(told):
+    """A driver may lose the GPU's memory without an error."""
+    notices, lines = told
+    clock, gpu, stop = SleepingClock(), WokenGpu(), threading.Event()
+    watch = GpuWatch(gpu, notices, stop, clock)
+    for asleep_ns, changed, forgotten in ((0, 0, 0), (10**8, 3, 0), (5 * 10**9, 0, 1)):
+        clock.asleep, gpu.changed = asleep_ns, changed
+        clock.work(1.1e9)
+        watch.look()
+        assert (gpu.forgotten, stop.is_set()) == (forgotten, False)
+    clock.asleep, gpu.changed = 9 * 10**9, 2
+    clock.work(0.5e9)
+    watch.look()  # not before a second has passed
+    assert not stop.is_set()
+    clock.work(0.6e9)
+    watch.look()
+    assert stop.is_set()
+    assert [kind for kind, _ in lines] == ["resumed", "resumed", "gpu-lost"]
+    assert "slept for 4.9 s" in lines[0][1] and "2 of the tables" in lines[2][1]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from hilstar.instruments.assess.components import EDGES, components_of
+from hilstar.instruments.assess.components import EDGES, _component, components_of
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
 # From 4000 answers the noise is known to 0.7 %, and a pixel error of 0.6 of it to 1.5 %. A star
@@ -58,3 +60,19 @@ def test_smooth_waves_and_noise_alone_have_no_jumps() -> None:
         found = components_of(error + rng.normal(size=error.shape), scalar_first(true), SCALE)
         assert not found.pixel.detail.endswith(EDGES)
         assert np.sqrt(found.noise_variance) == pytest.approx([1.0, 1.0, 1.0], rel=NOISE_WITHIN)
+
+
+def test_the_noise_that_a_fit_takes_up_is_no_part_of_its_variance(rng) -> None:
+    """30 functions of 200 answers take up 0.15 of the noise's variance, and 0.5 beside an error of
+    that.
+    """
+    basis, _ = np.linalg.qr(rng.normal(size=(200, 30)))
+    functions = SimpleNamespace(fit=lambda wanted: basis @ (basis.T @ wanted), freedom=30.0)
+    for variance in (0.0, 0.5):
+        found = []
+        for _ in range(30):
+            error = np.sqrt(variance * 200 / 30) * basis @ rng.normal(size=(30, 3))
+            noisy = error + rng.normal(size=error.shape)
+            found.append(_component(functions, noisy, 0.0).variance)
+        # a variance of 30 functions is known to a quarter, and that of 90 of them to 0.03
+        assert np.mean(found) == pytest.approx(variance, abs=0.06)

@@ -223,3 +223,10 @@ def test_the_table_keeps_what_was_found(tmp_path: Path, rng: np.random.Generator
     settings = read_bench_file(path).config.alignment
     assert settings is not None and settings.dof == found.dof
     assert np.array(settings.covariance_arcsec2) == pytest.approx(found.covariance_arcsec2)
+
+
+def test_a_telescope_points_by_azimuth_from_north_over_east_and_by_elevation_up():
+    """In north, east, down."""
+    right = math.pi / 2
+    for angles, wanted in (((0, 0), (1, 0, 0)), ((right, 0), (0, 1, 0)), ((1, right), (0, 0, -1))):
+        np.testing.assert_allclose(pointing(*angles), wanted, atol=1e-15)

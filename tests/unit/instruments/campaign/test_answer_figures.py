@@ -12,6 +12,7 @@ import pytest
 
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.answer_figures import fit_by_cases
 from hilstar.instruments.campaign.cases import (
     FRAME_ERRORS,
     FRAME_RATE_ERRORS,
@@ -140,6 +141,23 @@ def test_a_planted_error_is_found_and_judged(quantity: str, rng: np.random.Gener
     assert found.verdict == NOT_MET and found.margin is not None and found.margin < 0
     kept = size * (0.5 if side == "minimum" else 1.5)
     assert verdict(cases, quantity, **{side: kept}).verdict == MET
+
+
+def test_one_value_a_case_has_the_covariance_of_a_mean(rng: np.random.Generator) -> None:
+    values = rng.normal(3.0, 2.0, 6)
+    fit = fit_by_cases(np.ones((6, 1)), values, np.arange(6))
+    assert fit.value == pytest.approx([values.mean()])
+    assert fit.covariance[0, 0] == pytest.approx(values.var(ddof=1) / 6)
+
+
+def test_a_late_stamp_and_a_slow_gyroscope_are_found_in_seconds(
+    rng: np.random.Generator,
+) -> None:
+    """Stamps 20 ms off, and rates that lag by 0.3 s: errors of arcsec and deg/s in slews."""
+    late = verdict(answers(rng, stamp_bias=0.02), "time-bias", maximum=1.0)
+    assert late.value == pytest.approx(0.02, rel=0.05)
+    lagging = verdict(answers(rng, rate_lag=0.3), "rate-lag", maximum=0.28)
+    assert lagging.value == pytest.approx(0.3, rel=0.05)
 
 
 def test_no_false_star_in_so_many_frames_bounds_them_by_the_rule_of_three(

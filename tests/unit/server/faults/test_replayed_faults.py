@@ -158,7 +158,12 @@ def test_a_frame_without_faults_is_that_of_a_run_without_a_scenario(log, tmp_pat
 
 def test_frames_freeze_and_blank_and_the_ledger_says_by_what(bench, log, tmp_path):
     scenario = parse_scenario(tmp_path / "faults.toml", SCENARIO)
-    _, codes, _ = played(bench, log, tmp_path / "run.mcap", scenario)
+    frames, codes, _ = played(bench, log, tmp_path / "run.mcap", scenario)
+    # what stands on the display grows older
+    of = {shown.number: shown for shown in frames}
+    for k in range(20, 25):
+        older_ns = of[k].attitude.age_ns - of[19].attitude.age_ns
+        assert older_ns == of[k].t_ns - of[19].t_ns > 0
     assert all(np.array_equal(codes[19], codes[k]) for k in range(20, 25)) and not np.array_equal(
         codes[19], codes[25]
     )

@@ -25,8 +25,8 @@ TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 HEAD = f"""\
 # Commands
 
-`hilstar COMMAND -h` (or `--help`) prints the same for one command, and `hilstar --version` the version. This page is generated
-from the commands themselves (`python tools/make_pages.py`).
+`hilstar help COMMAND` (or `hilstar COMMAND -h`) prints the same for one command, and `hilstar --version` the version. This page is
+generated from the commands themselves (`python tools/make_pages.py`).
 
 Every command that has `--json` then prints one JSON object on stdout and nothing else there. An output named `-`
 is stdout, for CSV and TOML alone; what the command says then goes to stderr.

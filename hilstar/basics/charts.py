@@ -33,6 +33,8 @@ Share = Literal["row", "col"]
 
 WIDTH_INCH = 7.6  # 730 CSS pixels: a column of text
 PANEL_INCH, MARGIN_INCH = 2.6, 1.1  # height of each row of panels, and of title and labels
+# Fewer ticks fit into a smaller panel, whose labels make it smaller: it settles in two or three.
+LAYOUT_ROUNDS = 4
 PNG_DPI = 150
 TITLE_PT, TEXT_PT, SMALL_PT = 11.5, 10, 9
 TITLE_COLUMNS, NOTE_COLUMNS = 80, 105
@@ -181,6 +183,9 @@ def finish(figure: "Figure") -> None:
     side_names = _SIDE_NAMES.pop(figure, [])
     for axes in panels:
         axes.set_title(capital(axes.get_title(loc="left")))
+        # Matplotlib fits ticks into an axis by the style of now, unless it has its own size: a
+        # figure that is written outside the style would have others than it was laid out with.
+        axes.tick_params(labelsize=SMALL_PT)
     every: list[Any] = [axis for axes in panels for axis in (axes.xaxis, axes.yaxis)]
     for axis in every:
         axis.set_label_text(capital(axis.get_label_text()))
@@ -199,10 +204,10 @@ def finish(figure: "Figure") -> None:
         for text in texts:
             text.remove()
         texts[:] = [text for axes, named in side_names for text in _name_at_side(axes, named)]
-        return [tuple(axis.get_ticklocs()) for axis in log_axes], [text.xyann[0] for text in texts]
+        return [tuple(axis.get_ticklocs()) for axis in every], [text.xyann[0] for text in texts]
 
     room = place()
-    for _ in range(3):
+    for _ in range(LAYOUT_ROUNDS):
         if engine is not None:
             engine.execute(figure)
         if room == (room := place()):

@@ -181,7 +181,7 @@ def _refuse_blank(pixels: npt.NDArray[Any], header: Any) -> None:
 
 
 def _stated(header: Any, keys: Iterable[str]) -> Iterator[str]:
-    """Those keywords that a header has a value of."""
+    """The keywords, of those given, to which a header gives a value."""
     for key in keys:
         value = header.get(key)
         if value is not None and str(value).strip():
@@ -339,7 +339,9 @@ def _of_days(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
 
 
 def _role(role: str, comment: str) -> str:
-    """Some write the middle or the end, and say so in the comment."""
+    """Whether a time is that of the exposure's begin, middle or end: `role`, unless the keyword's
+    comment says otherwise, as some programs' do.
+    """
     text = comment.lower()
     if "mid" in text:
         return MIDDLE

@@ -31,9 +31,9 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class Notice:
     """One event of a run: when (host time, ns), of what kind (a word such as "stale"), a line for a
-    person, who caused it.
+    person, and who caused it.
 
-    `since_ns` is when that began of which it tells, where this was earlier.
+    `since_ns` is when the condition that it tells of began, where that was earlier.
     """
 
     host_ns: int

@@ -249,7 +249,9 @@ class TextTable:
     def _is_header(self, cells: list[str]) -> bool:
         if not self.header or cells[0].strip().strip('"') != self.columns[0].header:
             return False
-        return [column_of(cell).header for cell in cells] == [each.header for each in self.columns]
+        return [column_of(cell).header for cell in cells] == [
+            column.header for column in self.columns
+        ]
 
     def _is_whole(self, cells: list[str], previous: list[str]) -> bool:
         """Whether a row whose line has no end is whole, by its last cell beside those of other
@@ -875,7 +877,7 @@ def is_valid(path: Path, line: int, cell: str) -> bool:
 
 
 def number_fault(text: str) -> str:
-    """What a cell is that is no finite number, as far as its form says it; "" elsewhere."""
+    """Why a cell is no number, and what to write, where its form shows that; "" elsewhere."""
     if DECIMAL_COMMA.fullmatch(text) and not NOT_SURELY_A_COMMA.fullmatch(text):
         return " (a decimal comma: write a point)"
     if FORTRAN.fullmatch(text):

@@ -87,7 +87,8 @@ def latency(
             edges_read = by_diode.capture_edges(*parse_diode(diode), duration)
         time.sleep(LEDGER_BEHIND_S)
     else:
-        edges_read = _filmed(ledger, grab or "", duration, exposure)
+        with busy(f"filming the square for {duration:g} s"):
+            edges_read = _filmed(ledger, grab or "", duration, exposure)
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         by_diode.save_edges(save, edges_read)

@@ -89,6 +89,8 @@ def place_of(
 def parse_radec(text: str) -> tuple[float, float, float]:
     """Right ascension, declination and roll in degrees. Raises InputError."""
     parts = [part.strip() for part in text.split(",")]
+    if len(parts) == 1 and (meant := _star_named(text)):
+        raise InputError(f"--radec {shortened(text)}: is a star; write --star {meant}")
     if len(parts) == 3 and not all(map(_is_number, parts[:2])):
         # without a unit, a right ascension of several parts is hours
         ra_deg = _sexagesimal_deg(parts[0], "hourangle", text)
@@ -121,6 +123,15 @@ def parse_star(text: str, epoch_jyear: float) -> tuple[float, float, float]:
         return *named_stars.star_place_deg(name, epoch_jyear), roll_deg
     except InputError as error:
         raise InputError(f"--star {error}") from error
+
+
+def _star_named(text: str) -> str:
+    """A star's name as an option's value; "" for what is no name."""
+    from hilstar.sky.named_stars import hip_named
+
+    if hip_named(text) is None:
+        return ""
+    return f"'{text}'" if " " in text else text
 
 
 def _is_number(text: str) -> bool:

@@ -163,6 +163,8 @@ def wanted_samples(
             ),
             math.inf,
         )
+    if place is not None:
+        say("--radec and --star say where a --spin begins; the log has attitudes of its own")
     read = open_log(log or Path(), statements.stated())
     recorded = read.samples
     for _, line in [*read.told, *read.joins().told]:

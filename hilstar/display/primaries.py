@@ -168,9 +168,9 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
         names, _, rest = rest.partition("END_DATA_FORMAT")
         keys: dict[str, str] = {}
         for line in head.splitlines():
-            words = shlex.split(line, comments=True)
-            if len(words) == 2:
-                keys[words[0]] = words[1]
+            key_and_value = shlex.split(line, comments=True)
+            if len(key_and_value) == 2:
+                keys[key_and_value[0]] = key_and_value[1]
         first = float(keys["SPECTRAL_START_NM"])
         last = float(keys["SPECTRAL_END_NM"])
         nm = np.linspace(first, last, int(keys["SPECTRAL_BANDS"]))

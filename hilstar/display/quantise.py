@@ -390,10 +390,10 @@ class CodeTable:
         lower = lower[asked]
         if (place[1:] == place[:-1]).any():  # thresholds rise
             return None
-        words = np.full(len(self.first_code), none)
-        words[place] = lower
-        words |= self.first_code << np.uint32(self.bin_shift + 1)
-        return np.concatenate([[none], words])
+        bins = np.full(len(self.first_code), none)
+        bins[place] = lower
+        bins |= self.first_code << np.uint32(self.bin_shift + 1)
+        return np.concatenate([[none], bins])
 
 
 def code_table(thresholds: Float32Array) -> CodeTable:

@@ -416,9 +416,10 @@ class SampledPsf(Psf):
         """Refuse what is no PSF."""
         samples = self.samples
         if samples.ndim != 2 or not all(side % 2 for side in samples.shape):
-            found = " x ".join(map(str, samples.shape[::-1]))
+            size_text = " x ".join(map(str, samples.shape[::-1]))
             raise InputError(
-                f"a PSF of {found} samples has no middle; write an image of odd width and height"
+                f"a PSF of {size_text} samples has no middle; write an image of odd width and"
+                " height"
             )
         if self.per_px < 1:
             raise InputError(f"a PSF of {self.per_px} samples a pixel; write 1 or more")

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -198,8 +198,8 @@ def plain_catalog(
         "epoch_jyear": np.full(n, HIPPARCOS_EPOCH_JYEAR),
         "identifier": np.arange(1, n + 1, dtype=np.int64),
     }
-    columns = none | columns
-    return Catalog(**columns, designation=designation, rows_read=rows_read)  # type: ignore[arg-type]
+    by_name: dict[str, Any] = none | columns
+    return Catalog(**by_name, designation=designation, rows_read=rows_read)
 
 
 def load_catalog(source: str | Path = "hipparcos", faintest_v_mag: float = math.inf) -> Catalog:

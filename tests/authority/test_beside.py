@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from hilstar.basics.errors import MachineError
-from tests.support.beside import astrometry_side, lost_side
+from tests.support.beside import astrometry_side, lost_side, pyxel_side, stellarium_side
 from tests.support.beside.steps import Beside
 
 # float32 shares are within MAX_SHARE_ERROR (1e-7) by polynomial, and 1.2e-7 of rounding
@@ -26,6 +28,14 @@ IMAGE_ARCSEC = 1.0
 BENT_PX, FREE_PX = 2e-3, 0.1
 # LOST prints six digits: places are rounded evenly, and 364 of them tell their rms within 10 %
 DIGITS = 1.1
+# programs of minutes, or of an environment of their own
+on_demand = pytest.mark.skipif(
+    "HILSTAR_BESIDE" not in os.environ, reason="runs on demand: HILSTAR_BESIDE=1"
+)
+MEAN_DN, PATTERN = 0.25, 0.02  # of 250 000 pixels; Pyxel's means and scatters go to 0.06 and 0.5 %
+DARK = 1e-6  # one law, written twice
+# Hipparcos in both, by its steps; UT1 as IERS predicts it, planets by VSOP87 and by DE421
+STARS_ARCSEC, PLANETS_ARCSEC, PLANETS_MAG = 0.3, 1.0, 0.03
 # the Bright Star Catalogue's own errors, beside 0.32 arcsec of rounding
 CATALOGUE_ARCSEC = 1.0
 
@@ -102,3 +112,24 @@ def test_lost_s_generator_has_stars_where_hilstar_has_them():
     )
     assert lost.size(subject, "and pixels from their centres") < CATALOGUE_ARCSEC
     assert lost.size(subject, "as both come") > 1000 * CATALOGUE_ARCSEC  # its roll's sign
+
+
+@on_demand
+def test_pyxel_s_photon_transfer_is_hilstar_s_but_for_its_pattern(tmp_path):
+    pyxel = pyxel_side.run(tmp_path)
+    subject = "photon transfer: mean"
+    assert pyxel.size(subject, "half a DN for that") < MEAN_DN
+    sigma = pyxel.size(pyxel_side.VARIANCE, "one sigma")
+    assert pyxel.size(pyxel_side.VARIANCE, "as both come") < SIGMAS * sigma
+    assert pyxel.size(pyxel_side.PRNU, "light, Pyxel's halved") < PATTERN
+    assert pyxel.size(pyxel_side.PRNU, "scatter to Pyxel's doubled") < PATTERN
+    assert pyxel.size("dark current, 233 to 300 K", "with the gap") < DARK
+
+
+@on_demand
+def test_stellarium_has_stars_and_planets_where_hilstar_has_them(tmp_path):
+    stellarium = stellarium_side.run(tmp_path)
+    stars, bodies = stellarium_side.STAR_PLACES, stellarium_side.BODY_PLACES
+    assert stellarium.size(stars, "some at their places of 1991.25") < STARS_ARCSEC
+    assert stellarium.size(bodies, "without Moon") < PLANETS_ARCSEC
+    assert stellarium.size("magnitudes", "planets") < PLANETS_MAG

@@ -14,6 +14,7 @@ from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.facts import MOTION, facts_of, motion_at
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 from hilstar.sky.synthetic import ab_electrons_per_s, colours, vega_electrons_per_s
+from tests.support.claims import holds
 
 EPOCHS_JYEAR = (1950.0, 2000.0, 2026.0)
 STARS = 300
@@ -81,6 +82,11 @@ def test_errors_are_those_of_erfa(epoch_jyear):
         assert np.sqrt(np.diag(ours[k])) == pytest.approx(
             np.sqrt(np.diag(theirs)), rel=SIGMA_LIMIT
         ), stars.hip[k]
+    if epoch_jyear == EPOCHS_JYEAR[-1]:
+        every = facts_of(catalog.hip)
+        for name, jyear in (("1991", 1991.25), ("2026", epoch_jyear)):
+            variance_mas2 = motion_at(catalog, every, jyear).covariance[:, 0, 0]
+            holds(f"place-error-{name}", np.nanmedian(np.sqrt(variance_mas2)))
 
 
 def test_errors_of_1991_are_the_catalogue_s():

@@ -77,16 +77,14 @@ def shown_light(method, field, frames=1, first=0):
     numbers, rates = np.arange(len(x)), np.full(len(x), RATE_E_PER_S)
     stars = pack_sprites(columns + x, rows + y, rates, numbers, (side, side), psf.footprint_px)
     near = np.arange(-HALF_PX, HALF_PX + 1)
+    squares = rows[:, None, None] + near[:, None], columns[:, None, None] + near
     shown = 0.0
     with Renderer(target) as renderer:
         for frame in range(first + frames):
             renderer.draw(stars, frame)
             if frame >= first:
                 light = light_of_codes(renderer.levels().astype(np.float64), 8, "srgb")
-                shown = (
-                    shown
-                    + light[rows[:, None, None] + near[:, None], columns[:, None, None] + near]
-                )
+                shown = shown + light[squares]
     return WHITE_E_PER_S * shown / frames
 
 
@@ -114,6 +112,7 @@ def test_a_star_six_magnitudes_under_white_keeps_its_light_and_its_place(method,
     holds("mag-under-white", MAG_UNDER_WHITE)
     shown = shown_light(method, field)
     holds(f"codes-{method}-light", np.abs(magnitudes_off(shown)).max())
+    holds(f"codes-{method}-ripple", np.ptp(magnitudes_off(shown)))
     off_px = places_off(shown, field, rng)
     holds(f"codes-{method}-fit", rms(off_px["fit"]))
     holds(f"codes-{method}-moment", np.hypot(*off_px["moment"]).max())

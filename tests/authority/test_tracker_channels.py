@@ -152,10 +152,8 @@ def test_the_near_infrared_of_a_bare_sensor_is_the_librarys_own():
         axis=0,
     )
     for one in "GM":
-        light = [
-            np.interp(FINE_NM, nm, spectrum) * sensitivity
-            for spectrum in flux[[str(kind).startswith(one) for kind in kinds]]
-        ]
+        of_class = [str(kind).startswith(one) for kind in kinds]
+        light = [np.interp(FINE_NM, nm, spectrum) * sensitivity for spectrum in flux[of_class]]
         shares = [part[FINE_NM >= 700].sum() / part.sum() for part in light]
         assert row["by_class"][one] == pytest.approx(np.mean(shares), abs=BUDGET)
         holds(f"infrared-{one.lower()}", 100 * row["by_class"][one])

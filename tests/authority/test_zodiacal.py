@@ -120,6 +120,10 @@ def test_its_v_magnitude_is_that_of_the_papers_other_unit():
         v_mag = -2.5 * np.log10(radiance * 1e-2 * mean / VEGA_V0_W_M2_M / 206_264.806**2)
         # 5 %; the tables have two digits
         assert v_mag == pytest.approx(10 - 2.5 * np.log10(s10 / 3600**2), abs=0.05)
+        if s10 == 60:
+            holds("zodiacal-pole", v_mag)
+            # of the brightest direction of table 17, 15 degrees from the Sun
+            holds("zodiacal-brightest", v_mag - 2.5 * np.log10(table().radiance.max() / radiance))
 
 
 def test_its_spectrum_is_table_19s_and_redder_near_the_sun():

@@ -19,6 +19,7 @@ from tests.support.waiting import PATIENCE_S
 
 OCTAVE = shutil.which("octave-cli")
 pytestmark = pytest.mark.skipif(OCTAVE is None, reason="octave-cli is not installed")
+LAST = 20  # datagrams, a tenth of a second
 HAS_UDP = "exit(double(isempty(pkg('list', 'instrument-control'))))"
 
 
@@ -85,5 +86,8 @@ def test_its_stream_is_taken(tmp_path):
         # a busy machine begins to read late
         assert any("the first attitude has come" in line for line in process.stderr)
         summary = interrupted(process)
-    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 600
+    # The run may end before it has read the last ones.
+    assert 600 - LAST < summary["packets"]["received"] <= 600
+    assert summary["packets"]["accepted"] == summary["packets"]["received"]
+    assert summary["packets"]["lost"] == 0
     assert summary["clock"]["jumps"] == 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hilstar.instruments.campaign.acceptance import Acceptance, ClauseVerdict
+from hilstar.instruments.campaign.acceptance import Acceptance
 from hilstar.instruments.campaign.acceptance_plan import read_acceptance_plan
+from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict
 from hilstar.instruments.campaign.backlog import Backlog
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session

@@ -82,6 +82,12 @@ class Started(subprocess.Popen):
         self._ignored = ignored
         super().__init__(*arguments, **more)
 
+    def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
+        # A test that fails has not ended its commands, which would be waited for for ever.
+        if kind is not None:
+            self.kill()
+        super().__exit__(kind, value, traceback)
+
     def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any,
                        startupinfo: Any, creationflags: Any, shell: Any, *more: Any) -> None:  # fmt: skip
         (p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite), new_session = (

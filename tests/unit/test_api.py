@@ -131,6 +131,18 @@ def test_what_is_no_bench_is_one_line():
         assert len(str(refused.value).splitlines()) == 1
 
 
+def test_what_a_bench_returns_is_one_line(bench):
+    frame = bench.frame(BELT)
+    dimmed = hilstar.compare(frame, frame.linear * 1.1)
+    results = (bench.simulate(BELT), bench.verify(1), bench.budget(), dimmed)
+    for found in (*results, hilstar.compare(frame, frame)):
+        assert repr(found).startswith("<hilstar ")
+        assert repr(found).endswith(">")
+        assert len(repr(found)) < 120
+        assert "\n" not in repr(found)
+    assert "NOT the same sky" in repr(dimmed)
+
+
 def test_a_frame_and_a_bench_are_one_line_and_a_picture(bench):
     frame = bench.frame(BELT)
     for shown, figures in ((frame, 5), (bench, 5)):

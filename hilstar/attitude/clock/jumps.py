@@ -99,7 +99,9 @@ class _TimeSteps:
         self._last = sample
 
     def show_no_jump(self, by_ns: float) -> bool:
-        """True where a jump by `by_ns` would show in the newest step of t_ns, and does not."""
+        """Whether the newest step of t_ns rules a jump by `by_ns` out: steps are even enough to
+        show it, and do not.
+        """
         if len(self._usual_ns) < MIN_STEPS:
             return False
         usual_ns = np.array(self._usual_ns)
@@ -244,7 +246,7 @@ class JumpFilter:
         return MAX_FOUND_LATE_NS
 
     def _agrees(self, arrival: SampleArrival, late_ns: float) -> bool:
-        """True where this one supports the samples in doubt: it is off by the same time, and
+        """Whether a sample supports those in doubt: its time is off by as much as theirs, and it
         follows them.
         """
         by_ns = AGREEMENT_NS if self._shows_none else self._agreement_ns
@@ -392,8 +394,8 @@ class KnownClockFilter:
             )
 
     def _look_behind(self, late_ns: int, host_ns: int) -> None:
-        """Say where even the quickest packet of some seconds comes late: times alone do not tell
-        a link from a clock.
+        """Tell the user where even the quickest packet of some seconds comes late. The times alone
+        do not say whether the link is slow or the sender's clock behind.
         """
         if self._quickest is None or host_ns - self._quickest[0] > 2 * BEHIND_EACH_NS:
             self._quickest = host_ns, late_ns

@@ -235,7 +235,7 @@ class Cause:
         return RATES if self.reading is None else CONVENTION
 
     def error(self, stretch: Stretch) -> float:
-        """How far turn and rate of a stretch are apart without it, rad/s."""
+        """How far turn and rate of a stretch are apart once the cause is mended, rad/s."""
         if self.reading is None:
             turn = stretch.turn
         else:
@@ -397,8 +397,8 @@ def cause_of(
 
 
 def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
-    """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far
-    better than with it.
+    """Whether a cause explains the rates: mended of it they fit, all but one in MORE_STRETCHES of
+    the stretches, and their median error falls to a third (MIN_BETTER) or less.
     """
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
     errors = [cause.error(stretch) for stretch in stretches]
@@ -622,7 +622,9 @@ def _noise(stretches: Sequence[Stretch]) -> float:
 
 
 def _joined(parts: Sequence[FloatArray]) -> FloatArray:
-    """Sums (n, 3) that begin at 0 each, as one that goes on."""
+    """One running sum (n, 3), from 0, of the running sums of successive stretches, each of which
+    begins at 0.
+    """
     ends = np.cumsum([part[-1] for part in parts], axis=0)
     begins = np.vstack((np.zeros(3), ends[:-1]))
     return np.vstack(
@@ -637,8 +639,8 @@ def _between(t_s: FloatArray, summed: FloatArray, edges_s: FloatArray) -> FloatA
 
 
 def _least(lags_s: FloatArray, off: FloatArray) -> float:
-    """The lag of the smallest error: the shortest of those that are nearly as good, as in a
-    swing a whole period more is.
+    """The lag with the smallest error. Of those nearly as good the shortest: in a periodic swing a
+    lag that is a whole period longer fits as well.
     """
     good = lags_s[off <= off.min() + LAG_TIE * (off.max() - off.min())]
     return float(good[np.abs(good).argmin()])

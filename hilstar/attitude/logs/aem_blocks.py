@@ -556,7 +556,7 @@ def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
 def _leaves(element: _Element, path: str) -> Iterator[tuple[str, _Element]]:
     for child in element.children:
         if child.children:
-            child.parts(*(each.name for each in child.children))
+            child.parts(*(grandchild.name for grandchild in child.children))
             yield from _leaves(child, f"{path}{child.name}/")
         else:
             yield path + child.name, child

@@ -98,19 +98,19 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
     if not kernels:
         kernels = _kernels_beside(path)
         notices.append(("kernels", _beside_line(kernels)))
-    arrays, said = _asked(path, kernels, stated.body)
-    if said["step_s"] is not None:
-        error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"
+    arrays, reply = _asked(path, kernels, stated.body)
+    if reply["step_s"] is not None:
+        error = f"{reply['error_rad'] * MAS_PER_RAD:.2g} mas"
         notices.append(
             (
                 "ck-step",
                 (
-                    f"read every {said['step_s']:.4g} s where the CK is a function of time; off by"
+                    f"read every {reply['step_s']:.4g} s where the CK is a function of time; off by"
                     f" {error} between"
                 ),
             )
         )
-    gaps_s = said["gaps_s"]
+    gaps_s = reply["gaps_s"]
     if gaps_s:
         if len(gaps_s) == 1:
             count = "1 gap"
@@ -122,7 +122,9 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
                 f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there",
             )
         )
-    return LogReading(_entries(arrays), _conventions(said), "give a CK whose times differ", notices)
+    return LogReading(
+        _entries(arrays), _conventions(reply), "give a CK whose times differ", notices
+    )
 
 
 def _entries(arrays: Mapping[str, Any]) -> Iterator[LogEntry]:

@@ -183,16 +183,16 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
     """
     if segment.kind in {4, 6}:
         return np.empty(0)
-    words = np.asarray(
+    numbers = np.asarray(
         spice.dafgda(handle, segment.first_word, segment.last_word), dtype=np.float64
     )
     where = f"{path}: segment {segment.number}"
-    count, packet_words = _packets(words, segment)
-    if count < 1 or packet_words < QUATERNION_WORDS or (packet_words + 1) * count > len(words):
+    count, packet_words = _packets(numbers, segment)
+    if count < 1 or packet_words < QUATERNION_WORDS or (packet_words + 1) * count > len(numbers):
         raise InputError(
-            f"{where}: its counts do not fit its {len(words)} words; is the file damaged?"
+            f"{where}: its counts do not fit its {len(numbers)} words; is the file damaged?"
         )
-    quaternions = words[: packet_words * count].reshape(count, packet_words)[:, :QUATERNION_WORDS]
+    quaternions = numbers[: packet_words * count].reshape(count, packet_words)[:, :QUATERNION_WORDS]
     norms = np.sqrt((quaternions * quaternions).sum(axis=1))
     bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
     if len(bad):
@@ -201,12 +201,12 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
         )
     if segment.kind in SMOOTH:
         return np.empty(0)
-    epochs = words[packet_words * count : (packet_words + 1) * count]
+    epochs = numbers[packet_words * count : (packet_words + 1) * count]
     if not np.isfinite(epochs).all() or (np.diff(epochs) <= 0).any():
         raise InputError(f"{where}: its times do not increase; is the file damaged?")
     # SPICE searches by a directory: the hundredth time (type 3), or the mean of it and the next
     # (type 1).
-    directory = words[(packet_words + 1) * count :][: (count - 1) // DIRECTORY]
+    directory = numbers[(packet_words + 1) * count :][: (count - 1) // DIRECTORY]
     hundredth = epochs[DIRECTORY - 1 : -1 : DIRECTORY]
     following = epochs[DIRECTORY::DIRECTORY]
     if not ((hundredth <= directory) & (directory <= following)).all():

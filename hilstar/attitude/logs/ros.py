@@ -469,15 +469,15 @@ def _begin(
     heard = chain([first], heard)
     if body is not None:
         wanted = frame(body)
-        heard = (each for each in heard if each.turn.body == wanted)
+        heard = (message for message in heard if message.turn.body == wanted)
     # Zeros and NaN from before an estimator ran may lack stamps and frames, too: what follows them
     # counts.
     unset = []
-    for each in heard:
-        if not is_unset(each.turn.q):
-            heard = chain([each], heard)
+    for message in heard:
+        if not is_unset(message.turn.q):
+            heard = chain([message], heard)
             break
-        unset.append(each)
+        unset.append(message)
     begin = list(islice(heard, 2))
     if not begin and not unset:
         raise InputError(
@@ -485,7 +485,7 @@ def _begin(
             " it has"
         )
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
-    stamped = any(each.turn.stamp_ns for each in begin)
+    stamped = any(message.turn.stamp_ns for message in begin)
     return [*begin, *unset][0], stamped, chain(unset, begin, heard)
 
 
@@ -555,14 +555,15 @@ def _of_tf(
 
 def _entries(heard: Iterator[_Heard], first: _RosTurn, stamped: bool) -> Iterator[LogEntry]:
     """Each attitude from the reference to the body, at its time, or why it is none."""
-    for each in heard:
-        w, x, y, z = each.turn.q
-        if is_unset(each.turn.q):
+    for message in heard:
+        w, x, y, z = message.turn.q
+        if is_unset(message.turn.q):
             fault = None
         else:
-            fault = _fault(each.turn, first, stamped)
+            fault = _fault(message.turn, first, stamped)
         yield LogEntry(
-            each.where, fault or checked_sample(each.t_ns(stamped), (w, -x, -y, -z), each.turn.rate)
+            message.where,
+            fault or checked_sample(message.t_ns(stamped), (w, -x, -y, -z), message.turn.rate),
         )
 
 

@@ -50,6 +50,16 @@ EPOCH_DAY = date(1970, 1, 1).toordinal()
 SECONDS_PER_DAY = 86_400
 SHOWN_CHARACTERS = 60
 ACK = b"Ack\n"
+THIS_MACHINE = AllowedSenders()
+USE = RoadUse(
+    table="[attitude]",
+    where="",
+    lost="lost",
+    lost_line="{endpoint}: 42 closed the connection; waiting for it to come back",
+    back="back",
+    back_line="42 is connected again",
+    second_line="a second connection, from {host}, is closed; 42 has one already",
+)
 
 
 def written(q_icrs_to_body: FloatArray) -> str:
@@ -171,18 +181,6 @@ def _time_ns(text: str) -> int | None:
     days = date(year, 1, 1).toordinal() - 1 + day_of_year - EPOCH_DAY
     seconds = days * SECONDS_PER_DAY + hour * 3600 + minute * 60 + second
     return seconds * NS_PER_S + int((match[6] or "").ljust(9, "0"))
-
-
-THIS_MACHINE = AllowedSenders()
-USE = RoadUse(
-    table="[attitude]",
-    where="",
-    lost="lost",
-    lost_line="{endpoint}: 42 closed the connection; waiting for it to come back",
-    back="back",
-    back_line="42 is connected again",
-    second_line="a second connection, from {host}, is closed; 42 has one already",
-)
 
 
 def tcp_road(

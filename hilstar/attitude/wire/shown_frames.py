@@ -188,12 +188,12 @@ class FrameWatch(ZmqRoad):
 
     def frames(self, timeout_ms: int) -> list[ShownFrame]:
         """The frames that came, oldest first; waits at most `timeout_ms` for the first."""
-        found = []
+        frames_shown = []
         for message in self.taken(timeout_ms):
             frame = read_frame(list(message.parts))
             if isinstance(frame, ShownFrame):
-                found.append(frame)
+                frames_shown.append(frame)
             else:
                 self.refused = self.refused + 1
                 self.why_refused = frame
-        return found
+        return frames_shown

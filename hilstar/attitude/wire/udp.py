@@ -77,12 +77,12 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
         if network.version != version:
             continue
         address, mask = network.network_address.packed, network.netmask.packed
-        words = range(0, len(address), WORD_BYTES)
+        word_places = range(0, len(address), WORD_BYTES)
         # each word of the source address must be the network's, else go on after this network
-        for k, at in enumerate(words):
+        for k, at in enumerate(word_places):
             address_word = int.from_bytes(address[at : at + WORD_BYTES], "big")
             mask_word = int.from_bytes(mask[at : at + WORD_BYTES], "big")
-            to_next_network = 3 * (len(words) - k - 1) + 1
+            to_next_network = 3 * (len(word_places) - k - 1) + 1
             code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + SOURCE_AT[version] + at))
             code.append(INSTRUCTION.pack(AND, 0, 0, mask_word))
             code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, to_next_network, address_word))

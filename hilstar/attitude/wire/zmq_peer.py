@@ -52,12 +52,12 @@ def peer_trouble(address: str, answer: bytes | None, kind: str, keys: bool) -> s
     mechanism = answer[MECHANISM].rstrip(b"\0").decode(errors="replace")
     if keys or mechanism != "NULL":
         return _keys_trouble(address, mechanism, keys)
-    told = SOCKET_TYPE.search(answer, GREETING_BYTES)
-    if told is None or told[2].decode() in PARTNERS[kind]:
+    socket_type = SOCKET_TYPE.search(answer, GREETING_BYTES)
+    if socket_type is None or socket_type[2].decode() in PARTNERS[kind]:
         return ""
     return (
-        f"{address}: a {told[2].decode()} socket is there, and ours is {kind}; let the other side"
-        f" open a {wanted} socket"
+        f"{address}: a {socket_type[2].decode()} socket is there, and ours is {kind}; let the other"
+        f" side open a {wanted} socket"
     )
 
 

@@ -244,8 +244,8 @@ class PromptWhileLight:
         self._used_s = cpu_s()
 
     def give_up(self) -> None:
-        """Run this process as any other from now on, and whatever it starts: it is about to run
-        a user's code.
+        """Drop the real-time priority of this process, and of what it starts: it is about to run a
+        user's code.
         """
         _set_all_threads(os.SCHED_OTHER, 0)
         self._allowed = self._prompt = False

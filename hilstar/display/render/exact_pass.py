@@ -344,8 +344,8 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     box_3, box_5 = (
         np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5)
     )
-    words = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
-    return np.asarray(words, dtype=np.uint32)
+    packed = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
+    return np.asarray(packed, dtype=np.uint32)
 
 
 def overrated(width_px: tuple[float, float]) -> float:

@@ -62,9 +62,9 @@ class Target:
             return None
         width, height = self.resolution_px
         if self.uniformity is not None and self.uniformity.shape != (height, width):
-            found = " x ".join(map(str, self.uniformity.shape[::-1]))
+            size_text = " x ".join(map(str, self.uniformity.shape[::-1]))
             raise InputError(
-                f"the uniformity map is {found} px and the monitor {width} x {height}; give one"
+                f"the uniformity map is {size_text} px and the monitor {width} x {height}; give one"
                 " value per pixel"
             )
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
@@ -139,8 +139,8 @@ class Planes:
         if not self.apart or sprites.primaries is None:
             return sprites
         data = np.empty(len(sprites), dtype=APART_DTYPE)
-        words = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
-        words[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
+        fields = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
+        fields[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
         data["primaries_e_per_s"] = sprites.primaries
         data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(
             axis=1

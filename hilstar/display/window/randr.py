@@ -223,8 +223,8 @@ class Randr(Closing):
                     crtc = output.crtc if output is not None and _name(output) == name else 0
                 if not crtc:
                     continue
-                found = self._xrandr.XRRGetCrtcGamma(self._display, crtc)
-                with self._got(_Gamma, self._xrandr.XRRFreeGamma, found) as gamma:
+                crtc_gamma = self._xrandr.XRRGetCrtcGamma(self._display, crtc)
+                with self._got(_Gamma, self._xrandr.XRRFreeGamma, crtc_gamma) as gamma:
                     parts = () if gamma is None else (gamma.red, gamma.green, gamma.blue)
                     return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
         return b""
@@ -315,8 +315,8 @@ class Randr(Closing):
         return text
 
     def _providers(self) -> tuple[str, ...]:
-        found = self._xrandr.XRRGetProviderResources(self._display, self._root)
-        with self._got(_Providers, self._xrandr.XRRFreeProviderResources, found) as providers:
+        pointer = self._xrandr.XRRGetProviderResources(self._display, self._root)
+        with self._got(_Providers, self._xrandr.XRRFreeProviderResources, pointer) as providers:
             if providers is None:
                 numbers = []
             else:
@@ -354,14 +354,14 @@ class Randr(Closing):
 
     @contextmanager
     def _resources(self) -> Iterator[Any]:
-        found = self._xrandr.XRRGetScreenResourcesCurrent(self._display, self._root)
-        with self._got(_Resources, self._xrandr.XRRFreeScreenResources, found) as resources:
+        pointer = self._xrandr.XRRGetScreenResourcesCurrent(self._display, self._root)
+        with self._got(_Resources, self._xrandr.XRRFreeScreenResources, pointer) as resources:
             yield resources
 
     @contextmanager
     def _output(self, resources: Any, number: int) -> Iterator[Any]:
-        found = self._xrandr.XRRGetOutputInfo(self._display, ctypes.byref(resources), number)
-        with self._got(_Output, self._xrandr.XRRFreeOutputInfo, found) as output:
+        pointer = self._xrandr.XRRGetOutputInfo(self._display, ctypes.byref(resources), number)
+        with self._got(_Output, self._xrandr.XRRFreeOutputInfo, pointer) as output:
             yield output
 
     @contextmanager

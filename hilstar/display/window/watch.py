@@ -97,7 +97,7 @@ class PresentEvents:
 
     def modes(self) -> list[str]:
         """How each frame was shown that completed since the last call: "flip", "copy" or "skip"."""
-        found = []
+        modes_shown = []
         while event := self._xcb.xcb_poll_for_event(self._connection):
             # response_type, extension, sequence (2), length (4), event_type (2), kind, mode
             head = ctypes.string_at(event, 12)
@@ -109,8 +109,8 @@ class PresentEvents:
                 and head[10] == KIND_PIXMAP
                 and head[11] < len(MODES)
             ):
-                found.append(MODES[head[11]])
-        return found
+                modes_shown.append(MODES[head[11]])
+        return modes_shown
 
     def close(self) -> None:
         """End the connection."""

@@ -292,6 +292,11 @@ class Assessment:
     out_of_order: int = 0
     cube: CubeToBoresight | None = None
 
+    def __repr__(self) -> str:
+        across = self.noise_arcsec.cross
+        noise = "unknown" if across is None else f"{across:.2f} arcsec across"
+        return f"<hilstar assessment: {len(self.t_s)} answers, noise {noise}>"
+
     @property
     def missed_line(self) -> str:
         """The run's missed frames and what they do to the budget, in words."""

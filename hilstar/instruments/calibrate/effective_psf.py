@@ -387,7 +387,7 @@ def _each_gaussian(dots: Dots) -> tuple[Dots, FloatArray]:
 
 
 def _moved(dots: Dots) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Offsets of pixels from dots that are moved by STEP_PX along x, and along y."""
+    """The offsets of pixels from the dots if these were STEP_PX farther along x, and along y."""
     x, y = dots.offsets
     return (x - STEP_PX, y), (x, y - STEP_PX)
 

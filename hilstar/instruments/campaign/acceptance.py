@@ -6,19 +6,23 @@ that: campaigns that go on where they were. So the same command goes on where an
 a plan with other limits judges it again.
 """
 
-import functools
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import MachineError, one_line
 from hilstar.basics.files import write_whole
-from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
+from hilstar.instruments.campaign.acceptance_verdicts import (
+    AcceptedBench,
+    ClauseVerdict,
+    CostOfSet,
+    SetResult,
+)
 from hilstar.instruments.campaign.figures import TooFewCases
 from hilstar.instruments.campaign.requirements import (
     NOT_SHOWN,
@@ -30,13 +34,9 @@ from hilstar.instruments.campaign.results import Columns, read_cases
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.store import Directory, failures, require_parquet
-from hilstar.instruments.campaign.sweep import LevelCount, counted, edge_figure, next_level
-from hilstar.server.bench.alignment import cube_to_boresight
-from hilstar.server.bench.bench_file import BenchFile, read_bench_file
-from hilstar.server.bench.certificate_file import Certificate, CubeToBoresight, bench_certificate
+from hilstar.instruments.campaign.sweep import counted, edge_figure, next_level
 
-NOT_TESTED = "not tested"
-PLAN_FILE, LEDGER = "plan.toml", "ledger.csv"
+PLAN_FILE = "plan.toml"
 TIMED_CASES = 2  # of a set, whose time tells that of all
 LEDGER_COLUMNS = (
     *("case", "status", "why", "noise_seed", "ra_deg", "dec_deg", "roll_deg"),
@@ -46,66 +46,22 @@ LEDGER_COLUMNS = (
 RunCases = Callable[[Campaign, Directory, str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class ClauseVerdict:
-    """A clause with its verdict; `untested` says why it has none, "" where it has."""
-
-    clause: ClauseTable
-    verdict: RequirementVerdict | None
-    unit: str
-    untested: str = ""
-
-    @property
-    def word(self) -> str:
-        """The verdict in a word or two."""
-        return NOT_TESTED if self.verdict is None else self.verdict.verdict
-
-
-@dataclass(slots=True)
-class SetResult:
-    """What a set of cases gave: the cases of its table, or the levels of its sweep; where each
-    campaign is, and how many cases failed by reason.
-    """
-
-    case_set: CaseSet
-    cases: Columns | None = None
-    levels: list[LevelCount] = field(default_factory=list)
-    folders: list[Path] = field(default_factory=list)
-    failed: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class CostOfSet:
-    """How many cases a set has at most, and how long they take, s."""
-
-    case_set: CaseSet
-    cases: int
-    seconds: float
-
-
-class Acceptance:
-    """The acceptance of a plan in a directory. Raises InputError and MachineError."""
+class Acceptance(AcceptedBench):
+    """Runs a plan's cases and judges its clauses. Raises InputError and MachineError."""
 
     def __init__(
         self, plan: AcceptancePlan, bench: Path, directory: Path, solver: str, timeout_s: float
     ) -> None:
-        self.plan = plan
-        self.directory = directory
-        self.file: BenchFile = read_bench_file(bench)
-        self._solver = solver
+        super().__init__(plan, bench, directory, solver)
         self._timeout_s = timeout_s
-        self.on_bench = plan.through == "bench"
         self.sets = plan.sets
         require_parquet()
-        self.certificate: Certificate | None = None
-        if self.on_bench:
-            self.certificate = bench_certificate(self.file)
 
     def campaign(self, case_set: CaseSet, folder: Path, level: float | None = None) -> Campaign:
         """The campaign of a set of cases, at a level of its sweep."""
         text = case_set.text(level)
         path = self.plan.path
-        return Campaign(path, folder, self._solver, self._timeout_s, False, text=text)
+        return Campaign(path, folder, self.solver, self._timeout_s, False, text=text)
 
     def check(self) -> None:
         """Refuse (InputError) sets whose campaigns could not run, before the first case. What this
@@ -135,13 +91,16 @@ class Acceptance:
             if case_set.refused:
                 continue
             sweep = case_set.sweep
-            start = None if sweep is None else sweep.start
-            campaign = self.campaign(case_set, self.directory / case_set.name, start)
-            cases = campaign.cases * (1 if sweep is None else sweep.levels)
+            # the middle of a sweep costs something between its ends
+            levels = (None,) if sweep is None else (sweep.start, sweep.stop)
+            folder = self.directory / case_set.name
+            campaigns = [self.campaign(case_set, folder, level) for level in levels]
+            cases = campaigns[0].cases * (1 if sweep is None else sweep.levels)
             if self.on_bench:
-                yield CostOfSet(case_set, cases, cases * campaign.plan.limit_s)
+                yield CostOfSet(case_set, cases, cases * campaigns[0].plan.limit_s)
                 continue
-            yield CostOfSet(case_set, cases, cases * _case_s(campaign) / min(workers, cases))
+            case_s = sum(_case_s(campaign) for campaign in campaigns) / len(campaigns)
+            yield CostOfSet(case_set, cases, cases * case_s / min(workers, cases))
 
     def run(self, run_cases: RunCases) -> list[SetResult]:
         """Run what is missing of each set, in the plan's order."""
@@ -243,28 +202,6 @@ class Acceptance:
         except TooFewCases as few:
             return RequirementVerdict(clause.require, 0, None, None, NOT_SHOWN, None, str(few))
         return judged_figure(clause.require, figure)
-
-    @property
-    def scale(self) -> Scale:
-        """The scale of the tracker's image."""
-        tracker = self.file.config.tracker
-        focal_px = tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um
-        return Scale(focal_px, tracker.resolution_px)
-
-    @property
-    def own_error(self) -> tuple[tuple[float, float] | None, float]:
-        """How far the bench's own attitude may be off at 95 %, arcsec across and about, and its
-        own time, s; None and 0 where no certificate says it.
-        """
-        if self.certificate is None:
-            return None, 0.0
-        late_ms = self.certificate.expanded(("latency",)) or 0.0
-        return self.certificate.attitude_arcsec, late_ms / 1e3
-
-    @functools.cached_property
-    def cube(self) -> CubeToBoresight | None:
-        """From the reference to the tracker's boresight; None without [alignment]."""
-        return cube_to_boresight(self.file, self.certificate)
 
 
 def _unit(clause: ClauseTable, case_set: CaseSet) -> str:

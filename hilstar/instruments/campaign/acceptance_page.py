@@ -26,10 +26,10 @@ from hilstar.basics.pages import (
     table_of,
 )
 from hilstar.basics.version import __version__
-from hilstar.instruments.campaign.acceptance import (
+from hilstar.instruments.campaign.acceptance_verdicts import (
     LEDGER,
     NOT_TESTED,
-    Acceptance,
+    AcceptedBench,
     ClauseVerdict,
     SetResult,
 )
@@ -75,7 +75,7 @@ MAX_ROWS = 5000  # of points in a chart
 
 
 def write_acceptance(
-    acceptance: Acceptance, results: list[SetResult], verdicts: list[ClauseVerdict], rows: int
+    acceptance: AcceptedBench, results: list[SetResult], verdicts: list[ClauseVerdict], rows: int
 ) -> dict[str, Any]:
     """Write accept.html, acceptance.csv and acceptance.json; the JSON object. `rows` are those of
     the ledger. Raises InputError.
@@ -107,7 +107,9 @@ def verdict_of(verdicts: list[ClauseVerdict]) -> str:
     return MET
 
 
-def summary_of(acceptance: Acceptance, verdicts: list[ClauseVerdict], rows: int) -> dict[str, Any]:
+def summary_of(
+    acceptance: AcceptedBench, verdicts: list[ClauseVerdict], rows: int
+) -> dict[str, Any]:
     """The JSON object of `hilstar accept`."""
     arcsec, seconds = acceptance.own_error
     own = None if arcsec is None else {"cross": arcsec[0], "roll": arcsec[1]}
@@ -158,7 +160,7 @@ def _plain(value: object) -> object:
 
 
 def lines_of(
-    acceptance: Acceptance, results: list[SetResult], verdicts: list[ClauseVerdict]
+    acceptance: AcceptedBench, results: list[SetResult], verdicts: list[ClauseVerdict]
 ) -> list[str]:
     """A line for each clause on the terminal, for what no clause tests, and for failed cases."""
     width = max(len(each.clause.capability) for each in verdicts)
@@ -250,7 +252,7 @@ def _counts(verdicts: list[ClauseVerdict]) -> Iterator[KeyFigure]:
 
 
 def _cards(
-    acceptance: Acceptance, results: list[SetResult], verdicts: list[ClauseVerdict], rows: int
+    acceptance: AcceptedBench, results: list[SetResult], verdicts: list[ClauseVerdict], rows: int
 ) -> Iterator[Card]:
     yield _clauses(verdicts)
     yield _untested(acceptance, verdicts)
@@ -299,7 +301,7 @@ def _clauses(verdicts: list[ClauseVerdict]) -> Card:
     return Card("Clauses", words=texts, cure=cure, details=[how])
 
 
-def _untested(acceptance: Acceptance, verdicts: list[ClauseVerdict]) -> Card:
+def _untested(acceptance: AcceptedBench, verdicts: list[ClauseVerdict]) -> Card:
     rows = []
     for each in verdicts:
         if each.verdict is None:
@@ -370,7 +372,7 @@ def _detection(found: StarTable) -> Iterator[tuple[float, float, float, float]]:
         yield float(edges[k] + edges[k + 1]) / 2, share, share - low, high - share
 
 
-def _star_card(acceptance: Acceptance, result: SetResult) -> Iterator[Card]:
+def _star_card(acceptance: AcceptedBench, result: SetResult) -> Iterator[Card]:
     """Detection against magnitude, and the map of stars' place errors; none without stars."""
     assert result.cases is not None
     try:
@@ -402,7 +404,7 @@ def _seconds(value: float) -> str:
     return "more than was waited" if value > 0 else DASH
 
 
-def _about(acceptance: Acceptance, results: list[SetResult], rows: int) -> Card:
+def _about(acceptance: AcceptedBench, results: list[SetResult], rows: int) -> Card:
     plan = acceptance.plan
     file = acceptance.file
     ledger_sha256 = file_sha256(acceptance.directory / LEDGER)
@@ -410,6 +412,7 @@ def _about(acceptance: Acceptance, results: list[SetResult], rows: int) -> Card:
         ("plan", str(plan.path)),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
         ("through", plan.through),
+        ("solver", acceptance.solver_text),
         ("program", f"hilstar {__version__}"),
         ("ledger", f"{rows} cases in {LEDGER}, sha256 {ledger_sha256}"),
     ]

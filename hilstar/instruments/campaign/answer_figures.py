@@ -42,8 +42,8 @@ from hilstar.optics.camera import field_terms
 MIN_CASES = 8
 MAP_DEGREE = 5  # of the polynomials of a star's place error over the detector
 WILD_SIGMAS = 6.0
-ACROSS_SHARE = 0.3  # largest part of a slew's rate about the boresight, for the jitter
 SMALL_RATE_DEG_S = 1e-6
+MAX_EXPONENT = 50.0
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
@@ -149,10 +149,20 @@ def _root_mean(
     """
     number = np.unique(case, return_inverse=True)[1].reshape(-1)
     sums, whole = (_summed(values, number) for values in (squares, weights))
-    drawn = drawn_limits(sums, whole, rng, require.confidence)
-    value = math.sqrt(max(float(sums.sum() / whole.sum()), 0.0))
-    low, high = np.sqrt(np.maximum(drawn, 0.0)).tolist()
-    return BoundedFigure(value, min(low, value), max(high, value), len(sums), method)
+    c = require.confidence
+    low, high = drawn_limits(sums, whole, rng, c).tolist()
+    variance = float(sums.sum() / whole.sum())
+    # few cases draw limits that are too narrow: by their scatter and Student's t they are wider,
+    # and skew, as a variance is
+    count = len(sums)
+    if variance > 0 and count > 1:
+        scatter = float(((sums - variance * whole) ** 2).sum()) * count / (count - 1)
+        wide = float(stats.t.ppf(c, count - 1)) * math.sqrt(scatter) / float(whole.sum())
+        high = max(high, variance * math.exp(min(wide / variance, MAX_EXPONENT)))
+        low = min(low, variance - wide)
+    value = math.sqrt(max(variance, 0.0))
+    low, high = math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
+    return BoundedFigure(value, min(low, value), max(high, value), count, method)
 
 
 def _summed(values: FloatArray, number: IntArray) -> FloatArray:
@@ -245,8 +255,8 @@ def _jitter(
     rng: np.random.Generator,
 ) -> BoundedFigure:
     """The jitter of the stamp, s, from residuals (n, 3), arcsec, at rates (n, 3), arcsec/s."""
-    speed = np.linalg.norm(rates, axis=1)
-    slews = (speed > 3600 * SMALL_RATE_DEG_S) & (np.abs(rates[:, 2]) <= ACROSS_SHARE * speed)
+    speed = np.linalg.norm(rates[:, :2], axis=1)
+    slews = speed > 3600 * SMALL_RATE_DEG_S
     if len(np.unique(case[slews])) < MIN_CASES:
         raise TooFewCases("slews across the boresight tell it, and there are too few", 0)
     # the direction of the slew in the image plane, in which the noise has no preferred one

@@ -327,7 +327,7 @@ def parse_plan(path: Path, text: str) -> Plan:
                     f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out'
                 )
             _check_range(varied, plan.sampling)
-        _check_requires(plan.require)
+        _check_requires(plan)
         if plan.cases is None and plan.sampling != "grid":
             raise InputError(
                 f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000'
@@ -409,8 +409,14 @@ def _check_range(varied: Varied, sampling: Sampling) -> None:
         raise InputError(f'{where}: steps is for sampling = "grid"; leave it out')
 
 
-def _check_requires(requires: list[Require]) -> None:
-    for number, require in enumerate(requires, start=1):
+def _check_requires(plan: Plan) -> None:
+    for number, require in enumerate(plan.require, start=1):
+        columns = QUANTITY_COLUMNS.get(require.quantity)
+        if columns is not None and columns not in plan.columns:
+            raise InputError(
+                f"[[require]] number {number} ({require.quantity}): is found from columns that the"
+                f' table has not; write columns = ["{columns}"] at the top'
+            )
         if require.quantity == "edge":
             raise InputError(
                 f"[[require]] number {number} (edge): is of a sweep; write it as a [[clause]] of a"

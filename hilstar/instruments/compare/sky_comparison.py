@@ -91,13 +91,13 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
         columns = [(ones, zeros), (zeros, ones), (x, zeros), (y, zeros), (zeros, x), (zeros, y)]
         columns += [(-u * x, -v * x), (-u * y, -v * y)]
     design = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
-    found = _least_absolute(design, np.stack([u - x, v - y], axis=-1), FINEST_PX / scale)
+    coefficients = _least_absolute(design, np.stack([u - x, v - y], axis=-1), FINEST_PX / scale)
 
     def motion(at: FloatArray) -> FloatArray:
         x, y = at.T / scale
-        right, down, *more = found
+        right, down, *more = coefficients
         if rank == 1:
-            moved = np.broadcast_to(found, at.shape)
+            moved = np.broadcast_to(coefficients, at.shape)
         elif rank == 2:
             grow, turn = more
             moved = np.stack([right + grow * x - turn * y, down + grow * y + turn * x], axis=-1)
@@ -416,6 +416,11 @@ class SkyComparison:
     def same(self) -> bool:
         """Whether both images are one sky, in every channel."""
         return not self.bad and all(channel.same for channel in self.channels.values())
+
+    def __repr__(self) -> str:
+        if self.same:
+            return f"<hilstar comparison: the same sky, {self.star_count} stars>"
+        return f"<hilstar comparison: NOT the same sky, {len(self.bad)} of {self.star_count} stars>"
 
     @property
     def star_count(self) -> int:

@@ -53,7 +53,7 @@ class BenchGeometry:
         return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
 
     def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the mirror shows pixels (n,) of the image, and which pixels it shows there."""
+        """The places at which the mirrored display shows pixels (n,) of the image."""
         width, height = self.monitor.resolution_px
         middle_x = (width - 1) / 2
         middle_y = (height - 1) / 2

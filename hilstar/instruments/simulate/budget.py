@@ -100,6 +100,12 @@ class LightBudget:
     out_of_gamut: float | None
     star: StarSize
 
+    def __repr__(self) -> str:
+        return (
+            f"<hilstar budget: {self.method}, {self.bits} bits, stars from V ="
+            f" {self.clips_v_mag:.2f} (clips) to {self.nothing_v_mag:.2f} (shows nothing)>"
+        )
+
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     """The budget of a bench, places as `centroider` finds them in the tracker's pixels after its
@@ -108,7 +114,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     None takes the bench's own. Raises InputError for a bench without stars.
     """
     by = centroider or bench.config.verify.judge or USUAL
-    found = _errors(bench)
+    errors_by_mag = _errors(bench)
     render = bench.config.render
     white = bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
@@ -135,7 +141,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         ends_nm = [RED_NM]
     else:
         ends_nm = [RED_NM, reddest_nm(spectra)]
-    rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
+    rows = [_row(bench, mag, errors, by, clips) for mag, errors in errors_by_mag]
     return LightBudget(
         method=render.quantisation
         + (

@@ -65,6 +65,7 @@ class CameraExposures:
         self._clock = clock
         self._camera = camera
         self._always = always
+        self._begun_ns = begun_ns
         self._rate_hz = 0.0
         self._free = FreeExposures(clock, begun_ns, NS_PER_S)
         self._trigger_ns: int | None = None
@@ -76,8 +77,9 @@ class CameraExposures:
         camera = self._camera
         wanted = camera.wanted
         if wanted and camera.settings.triggered:
-            if self._trigger_ns is None:
-                self._trigger_ns = camera.trigger_ns()
+            if self._trigger_ns is None and (trigger_ns := camera.trigger_ns()) is not None:
+                # One that came before the display's first frame has that frame's light.
+                self._trigger_ns = max(trigger_ns, self._begun_ns)
             return self._trigger_ns
         if not (wanted or self._always):
             self._streamed = False

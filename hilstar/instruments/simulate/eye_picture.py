@@ -155,7 +155,7 @@ def _star_places(box_sum: FloatArray, box_noise: float) -> tuple[IntArray, IntAr
 
 
 def _is_wide(patch: FloatArray) -> bool:
-    """Whether the light in the middle of a patch goes on to where the largest disc ends."""
+    """Whether the light in the middle of a patch reaches beyond the largest disc."""
     middle = RING_PX // 2
     inner = slice(middle - MAX_RADIUS_PX, middle + MAX_RADIUS_PX + 1)
     near = patch[inner, inner]

@@ -158,10 +158,10 @@ def verify_heads(
             q_icrs_to_body = q / np.linalg.norm(q)
             first_frame = int(rng.integers(0, MASK_TURNS))
             solved = [head.solved(q_icrs_to_body, first_frame) for head in seen_by]
-            for pair, (one, other) in zip(pairs, combinations(solved, 2), strict=True):
-                if one is not None and other is not None:
-                    pair.linear_arcsec.append(_apart_arcsec(one[0], other[0]))
-                    pair.codes_arcsec.append(_apart_arcsec(one[1], other[1]))
+            for pair, (first_head, other) in zip(pairs, combinations(solved, 2), strict=True):
+                if first_head is not None and other is not None:
+                    pair.linear_arcsec.append(_apart_arcsec(first_head[0], other[0]))
+                    pair.codes_arcsec.append(_apart_arcsec(first_head[1], other[1]))
             on_field(number + 1)
     return pairs
 

@@ -226,8 +226,8 @@ class LiveTracker(Closing):
             levels.reshape(len(levels), math.prod(levels.shape[1:])).T,
         )
         lights = [
-            one.response.light[k] * one.flux_at_white_e_per_s
-            for one, k in zip(panels, columns, strict=True)
+            panel.response.light[k] * panel.flux_at_white_e_per_s
+            for panel, k in zip(panels, columns, strict=True)
         ]
         light = np.stack(lights, axis=1)
         if self._panel.uniformity is not None:

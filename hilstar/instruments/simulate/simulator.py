@@ -122,6 +122,13 @@ class Exposure:
     capped: int = 0
     faults: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        height, width = self.dn.shape
+        return (
+            f"<hilstar exposure: {len(self.truth)} stars, DN {self.dn.min()} to {self.dn.max()},"
+            f" {width} x {height} px>"
+        )
+
 
 class Simulator(Closing):
     """A bench's tracker looking at the sky itself, drawn in a GL context of its own or in another

@@ -434,13 +434,13 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
                 psf_sigma_px=(width_px, width_px),
                 minimum_pixels=2,
             )
-            found = find_stars(image, settings, LocalBackground(0.0, 1e-3))
-            tiles = np.stack([found.x_px // TILE_PX, found.y_px // TILE_PX]).astype(np.intp)
+            centroids = find_stars(image, settings, LocalBackground(0.0, 1e-3))
+            tiles = np.stack([centroids.x_px // TILE_PX, centroids.y_px // TILE_PX]).astype(np.intp)
             # the brightest of a tile
             first = np.unique(tiles[1] * PHASES + tiles[0], return_index=True)[1]
             column, row = tiles[:, first]
             true_x, true_y = (TILE_PX * tile + TILE_PX // 2 + steps[tile] for tile in (column, row))
-            off = np.concatenate([found.x_px[first] - true_x, found.y_px[first] - true_y])
+            off = np.concatenate([centroids.x_px[first] - true_x, centroids.y_px[first] - true_y])
             yield sigma_px, kelvin, name, float(np.sqrt((off**2).mean())), float(np.abs(off).max())
 
 

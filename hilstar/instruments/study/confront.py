@@ -142,15 +142,15 @@ def line_of(row: PhotographFound) -> str:
 
 def short_name(row: PhotographFound, rows: Sequence[PhotographFound]) -> str:
     """The words of an image's name that not all images of its camera share, whole."""
-    words = Path(row.image).stem.split("_")
+    parts = Path(row.image).stem.split("_")
     others = []
     for other in rows:
         if other.camera == row.camera and other.image != row.image:
             others.append(set(Path(other.image).stem.split("_")))
     if not others:
-        return " ".join(words)
+        return " ".join(parts)
     shared = set.intersection(*others)
-    return " ".join(word for word in words if word not in shared)
+    return " ".join(word for word in parts if word not in shared)
 
 
 def draw(path: Path, found: Sequence[PhotographFound]) -> None:

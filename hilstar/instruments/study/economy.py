@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -287,7 +288,9 @@ def within_words(comparisons: list[EffortComparison]) -> str:
 
 
 def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
-    """How much faster each scene is at what it needs, and its errors there, in tolerances."""
+    """The speed-up by `effort = "auto"` in each scene, and the errors that it leaves there,
+    relative to the tolerance.
+    """
     note = (
         "Errors of stars that stand alone; places by the worst of six centroiders, whose boxes have"
         " no threshold. Tolerances: "
@@ -334,7 +337,8 @@ def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
         for axes, name in ((speed, "as fast as full effort"), (error, "tolerance")):
             axes.axhline(1.0, color=RED, linewidth=1, label=name)
             axes.grid(visible=False, axis="x")
-            axes.set_ylim(0, 1.45 * max(1.0, *(bar.get_height() for bar in axes.patches)))  # type: ignore[attr-defined]
+            bars: Any = axes.patches
+            axes.set_ylim(0, 1.45 * max(1.0, *(bar.get_height() for bar in bars)))
         speed.set_ylabel("full / auto, time")
         error.set_ylabel("error / limit")
         # Shares of 0.25 would push the label off the canvas.

@@ -538,7 +538,9 @@ class Comparison:
     def _measure_noisy(
         self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]
     ) -> None:
-        """The same stars in a noisy exposure (h, w), DN: what the tracker itself adds."""
+        """Measure the same stars in a noisy exposure (h, w), DN: their errors are those of the
+        tracker itself.
+        """
         under = estimate_background(dn, 1.0)
         # rounding's: most of the image may be clipped at 0 DN, beside a glow
         if under.noise <= 1 / math.sqrt(12):

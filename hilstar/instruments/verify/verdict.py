@@ -203,21 +203,23 @@ def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
     """Errors that only the key `geometry` can describe."""
-    found = []
+    reasons = []
     if fit.tilt_px > limit_px:
         a, b = (math.degrees(angle) for angle in fit.tilt_rad)
-        found.append(
+        reasons.append(
             f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes,"
             f" {fit.tilt_px:.2f} px: {cure}"
         )
     if fit.distortion_px > limit_px:
-        found.append(f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}")
+        reasons.append(
+            f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}"
+        )
     if fit.left_px > limit_px:
-        found.append(
+        reasons.append(
             f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor"
             " distortion"
         )
-    return found
+    return reasons
 
 
 def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
@@ -225,7 +227,7 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
     common.
     """
     verify = measured.config.verify
-    found = []
+    reasons = []
     limit = verify.flux_mag
     p95_mag = p95(np.abs(errors.of("flux_mag")))
     alone = p95(np.abs(errors.of("codes_mag")))
@@ -235,7 +237,7 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
             ": light does not follow the codes as assumed, look at the monitor's response and"
             " uniformity"
         )
-        found.append(
+        reasons.append(
             f"flux is {p95_mag:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}"
         )
     offset = errors.zero_point_mag
@@ -246,9 +248,9 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
         else:
             cause = "look at flux_at_white_e_per_s"
         # A wrong response moves the median star too: then white may well be right.
-        if not (found and abs(of_codes) <= limit and verify.true_flux_at_white_e_per_s is None):
-            found.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
-    return found
+        if not (reasons and abs(of_codes) <= limit and verify.true_flux_at_white_e_per_s is None):
+            reasons.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
+    return reasons
 
 
 def _black(measured: Measured) -> list[str]:
@@ -340,6 +342,11 @@ class Verdict:
     def passed(self) -> bool:
         """True without any reason against it."""
         return not self.reasons
+
+    def __repr__(self) -> str:
+        words = "passed" if self.passed else "not passed"
+        counts = f"stars: {self.errors.looked_for}, reasons against it: {len(self.reasons)}"
+        return f"<hilstar verdict: {words}, {counts}>"
 
 
 def judge(measured: Measured) -> Verdict:

@@ -249,7 +249,7 @@ class FieldPoint:
 
     @property
     def is_vignetted(self) -> bool:
-        """Whether its pupil is not all lit."""
+        """Whether the field point has vignetting factors: a pupil that is compressed or shifted."""
         return any((*self.compression, *self.shift))
 
 
@@ -314,7 +314,7 @@ class LensFileReader(ABC):
     notes: list[str]
 
     def lens(self) -> LensPrescription:
-        """The whole. Raises InputError."""
+        """The prescription of all that was read. Raises InputError."""
         self._check_ends()
         kind, pupil = self._pupil()
         waves, primary = self._wavelengths()

@@ -249,7 +249,9 @@ def _where(glass: Glass) -> str:
 
 
 def _instead(written: str, plain: str) -> str:
-    """What to write: makers have new glasses of old names (N-SF11 for SF11), which are others."""
+    """What to write for a glass that no catalogue has: its maker may have a successor (N-SF11 for
+    SF11), which is another glass.
+    """
     glasses = [file for file in _database() if file.is_glass]
     for file in glasses:
         if file.name == f"n{plain}":

@@ -284,7 +284,9 @@ class _LensRays:
         return tangents, places.T
 
     def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
-        """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
+        """The fields (n, 2), relative to the largest, whose stars a camera images at places (n, 2),
+        mm.
+        """
         if self.max_field == 0:
             return np.zeros_like(places_mm)
         tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
@@ -538,8 +540,8 @@ def _counted(
 
 @dataclass(frozen=True, slots=True)
 class _Chiefs:
-    """The camera that the chief rays at the primary wavelength have: focal length, mm, and
-    Brown-Conrady relative to it.
+    """The camera of the chief rays at the primary wavelength: its focal length, mm, and
+    Brown-Conrady distortion of tangents.
     """
 
     focal_length_mm: float

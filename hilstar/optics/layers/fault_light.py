@@ -109,12 +109,12 @@ class FaultView:
         by_star = isinstance(fault, Flash | StarGone) and (fault.hip or fault.star)
         if by_star and not len(self._places(self.by.stars, fault)):
             if isinstance(by_star, str):
-                said = f'star = "{by_star}"'
+                star_key = f'star = "{by_star}"'
             else:
-                said = f"hip = {by_star}"
+                star_key = f"hip = {by_star}"
             raise InputError(
-                f"{said}: not among the {len(self.by.stars)} stars and bodies of this bench; write"
-                " one that is, or look at [sky] faintest_v_mag"
+                f"{star_key}: not among the {len(self.by.stars)} stars and bodies of this bench;"
+                " write one that is, or look at [sky] faintest_v_mag"
             )
         if isinstance(fault, PointLight | CosmicRays):
             self.by.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))

@@ -259,8 +259,9 @@ def _every(sprites: FrameLight, first: int, step: int) -> FrameLight:
 def worst_errors(
     stars: CodeStars, method: Quantisation, limit: tuple[float, float] = (math.inf, math.inf)
 ) -> CodeErrors:
-    """The worst errors of a method, of stars at rest and, where a frame may turn, on paths; of one
-    beyond the limit (mag, px) the first that are over it.
+    """The worst errors of a method for stars at rest and, where a frame may turn, on paths.
+
+    The search ends at the first errors that exceed the limit (mag, px): those are then given.
     """
     still = _worst(replace(stars, path_px=0.0), method, limit)
     if not stars.path_px or not still.within(limit):
@@ -345,7 +346,9 @@ class _Search:
         return self._by_grid[key]
 
     def _is_over_near(self, corner: Corner, radius_px: float, spans: float) -> bool:
-        """The same of stars about the worst so far, in its span."""
+        """Whether a star near the worst so far, in phase and brightness within its span, exceeds
+        the limit.
+        """
         stars = self._stars
         phases = corner.phases.near(corner.star, radius_px)
         begin, end = stars.spans[corner.span]

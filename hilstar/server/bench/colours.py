@@ -92,8 +92,8 @@ class Lateral:
 
     @property
     def lifted(self) -> FloatArray:
-        """By how much the curves that are asked of stars lie over the lens's own, px (k,): none
-        of them may be below 0.
+        """A constant (k,), px, that is added to the lens's curves before stars' means are taken of
+        them, so that none is below 0.
         """
         return np.asarray(2 * np.abs(self.px).max(axis=0))  # a spline passes its nodes by less
 

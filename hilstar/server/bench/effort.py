@@ -593,7 +593,7 @@ def psf_part(light: Light, choice: Choice) -> Choice:
 
 
 def depth_part(effort: Effort) -> Choice:
-    """The stars that are drawn: all but those that light no pixel."""
+    """The choice of the stars that are drawn: all but those too faint to light a pixel."""
     light = effort.light
     rates = light.rates_e_per_s
     limit = QUANTISERS[effort.quantisation].faintest_e_per_s(light.panel, light.psf)

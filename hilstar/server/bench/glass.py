@@ -56,8 +56,8 @@ class Onto:
 
     @property
     def matrix(self) -> FloatArray:
-        """Takes offsets of tracker pixels to display pixels (2, 2): by places half a pixel
-        beside the principal point.
+        """The matrix (2, 2) from offsets in tracker pixels to offsets in display pixels, by
+        differences half a pixel to either side of the principal point.
         """
         sides = np.array([(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
         ends = self.places_px(np.array(self.tracker.principal_point_px) + sides)

@@ -95,7 +95,7 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
             rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
         brightness = brightness_of(found, rows, shown.satellite_standard_mag, v0_e_per_s)
         satellites = moving.satellites = Satellites(found, brightness, v0_e_per_s, observer, utc_ns)
-        satellites.listed = sum(one.number in rows for one in found)
+        satellites.listed = sum(satellite.number in rows for satellite in found)
         satellites.file = str(path)
         satellites.place(utc_ns + start_ns)
     return moving

@@ -135,6 +135,11 @@ class AravisCamera:
             "incomplete": incomplete,
         }
 
+    def close(self) -> None:
+        """Let it go at once."""
+        if self.camera.is_gv_device():
+            self.device.leave_control()
+
     def _started(self, exposure_us: float, buffers: int) -> Any:
         """The stream of an acquisition with an exposure."""
         self.camera.set_exposure_time(exposure_us)

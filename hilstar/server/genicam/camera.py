@@ -37,6 +37,7 @@ INSTALL = (
 LIST_TIMEOUT_S = 15.0
 OPEN_TIMEOUT_S = 30.0
 GRAB_TIMEOUT_S = 60.0
+CLOSE_TIMEOUT_S = 2.0
 # Of an exposure as it was asked for: a camera sets it in steps of a row or a microsecond.
 EXPOSURE_TOLERANCE, EXPOSURE_STEP_US = 0.01, 20.0
 
@@ -294,9 +295,13 @@ class GenicamCamera(Closing):
         return f"--grab {PREFIX}{self.name}: {what}"
 
     def close(self) -> None:
-        """Let the camera go."""
-        self._child.kill()
-        self._child.communicate()
+        """Let the camera go, for the next who opens it."""
+        # With its input at an end the child lets it go; in the middle of an exposure it cannot.
+        try:
+            self._child.communicate(timeout=CLOSE_TIMEOUT_S)
+        except (subprocess.TimeoutExpired, ValueError):  # it is late, or has been closed
+            self._child.kill()
+            self._child.wait()
         self._folder.cleanup()
 
 

@@ -44,6 +44,9 @@ class OpenCamera(Protocol):
         arrival, ns.
         """
 
+    def close(self) -> None:
+        """Let it go at once: one that is only left is held until its heartbeat is missed."""
+
 
 def chosen(name: str, seen: list[dict[str, str]]) -> str:
     """The identifier of the camera that is meant. Raises LookupError."""
@@ -118,6 +121,13 @@ def main(
         say(cameras())
         return
     try:
-        serve(opened(sys.argv[2]), errors)
+        camera = opened(sys.argv[2])
     except errors as error:
         say({"error": words_of(error)})
+        return
+    try:
+        serve(camera, errors)
+    except errors as error:
+        say({"error": words_of(error)})
+    finally:
+        camera.close()

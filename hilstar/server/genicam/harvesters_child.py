@@ -172,6 +172,11 @@ class HarvestersCamera:
             "incomplete": incomplete,
         }
 
+    def close(self) -> None:
+        """Let it go at once."""
+        self.acquirer.destroy()
+        self.reader.reset()
+
     def _start(self, exposure_us: float) -> None:
         self.exposure.value = exposure_us
         self.acquirer.start()

@@ -665,7 +665,10 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ),
         ("predicted past the last packet", three(found.prediction_ms)),
         ("packet to swap", three(found.packet_to_swap_ms)),
-        *[(one.kind, f"{one.seconds:.1f} s: {one.text}") for one in found.wrong_sky.conditions],
+        *[
+            (condition.kind, f"{condition.seconds:.1f} s: {condition.text}")
+            for condition in found.wrong_sky.conditions
+        ],
         (
             "packets",
             (

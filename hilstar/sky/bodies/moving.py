@@ -93,11 +93,11 @@ START = SkyMoment(0)
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The bodies as an observer sees them at a moment: vectors (n, 3), km, its viewpoint, and unit
-    vectors.
+    """Bodies as an observer sees them at a moment: vectors `seen_km` (n, 3), unit vectors (n, 3),
+    and the viewpoint.
 
-    An Earth about the observer stands anywhere. `place_km` and `about_earth_km_s` (3,) are the
-    observer's about its centre.
+    From the Earth's own centre the direction to the Earth means nothing. `place_km` and
+    `about_earth_km_s` (3,) are the observer's place and velocity about that centre.
     """
 
     seen_km: FloatArray

@@ -432,8 +432,8 @@ def _reach_km(observer: FloatArray, half_s: float) -> float:
 def _within(
     along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach_km: float
 ) -> BoolArray:
-    """Whether vectors (n,), by their parts along an axis and their lengths, can come within an
-    angle of it by moving so far.
+    """Whether vectors (n,), of lengths `range_km` and with parts `along_km` along an axis, can come
+    within `radius_rad` of the axis when their ends move by up to `reach_km`.
     """
     moved = np.arcsin(np.minimum(1.0, reach_km / np.maximum(range_km, reach_km + OWN_KM)))
     limit = np.cos(np.minimum(np.pi, radius_rad + moved))

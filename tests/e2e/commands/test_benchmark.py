@@ -104,6 +104,7 @@ def test_each_count_is_judged_turning_against_still_and_beside_numba(measured):
         assert (beside and beside["aim_ms"]) == at.get((count, "numba", "linear_only"))
 
 
+@pytest.mark.timing
 def test_stages_make_up_the_whole_frame(measured):
     result, _ = measured
     for count in (100, 1000):

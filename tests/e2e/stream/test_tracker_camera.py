@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import from_radec_roll_deg
-from tests.support.benches import ROOT, TWIN, bench_text
+from tests.support.benches import ROOT, TWIN, bench_text, still_log
 from tests.support.commands import HILSTAR
 from tests.support.forks import Started
 from tests.support.gige_client import GigEClient, opened, own_address
@@ -101,6 +101,29 @@ def test_a_triggered_exposure_is_one_image_of_the_stars_that_are_lit(display):
         told, _ = ended(process)
     assert told["camera"]["triggers"] == told["camera"]["images"] == 3
     assert told["answers"] == 0
+
+
+def test_a_trigger_before_the_display_shows_anything_is_an_image_of_its_first_frames(tmp_path):
+    bench, log = tmp_path / "bench.toml", still_log(tmp_path / "log.csv", 600)
+    bench.write_text(bench_text(TWIN, {"render": {"quantisation": "round"}}))
+    address, endpoint = own_address(), f"tcp://127.0.0.1:{free_port()}"
+    replay = [*map(str, [*HILSTAR, "replay", bench, log, "--headless"]), "--feed", endpoint]
+    with (
+        tracker((bench, endpoint), "--camera", address) as process,
+        GigEClient(address) as client,
+    ):
+        opened(client)
+        client.control()
+        client.set("TriggerMode", 1)
+        client.set("AcquisitionStart", 1)
+        client.set("TriggerSoftware", 1)
+        with Started(replay, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as display:
+            number, _, image = client.image(SIDE_PX, SIDE_PX)
+            assert number == 1
+            assert np.count_nonzero(image > np.median(image) + 8 * _noise(image)) > 10
+            ended(process)
+            display.terminate()
+            display.wait(PATIENCE_S)
 
 
 def _noise(image: np.ndarray) -> float:

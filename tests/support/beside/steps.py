@@ -99,6 +99,7 @@ def draw_steps(axes: object, subject: str, steps: Sequence[Step]) -> None:
             textcoords="offset points",
             va="center",
             fontsize=SMALL_PT,
+            color=BLUE,
         )
     axes.set_xscale("log")
     axes.set_xlim(min(sizes) / 3, max(sizes) * (max(sizes) / min(sizes)) ** 0.25 * 3)

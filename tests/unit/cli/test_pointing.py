@@ -24,6 +24,7 @@ from hilstar.cli.send import wanted_samples
 from hilstar.server.bench.config.sky import SkySettings
 from tests.support.benches import ROOT
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.senders import free_port
 
 DEMO = str(resource_path("configs", "demo.toml"))
 SMALL = str(ROOT / "examples" / "bench.toml")
@@ -100,6 +101,14 @@ def test_a_spin_begins_at_the_star():
     assert np.array_equal(begun, attitude_of("send", None, "Vega", None))
 
 
+def test_a_log_has_attitudes_of_its_own(tmp_path):
+    words = ["send", str(ROOT / "examples" / "slew.csv"), "--to", f"udp://127.0.0.1:{free_port()}"]
+    words += ["--star", "Vega", "--wait", "0", "--count", "1"]
+    done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "--star say where a --spin begins" in done.stderr
+
+
 def test_the_epoch_without_a_bench_is_that_of_one_that_states_none():
     assert SkySettings().epoch_jyear == USUAL_EPOCH_JYEAR
 
@@ -115,6 +124,8 @@ def test_star_stands_wherever_radec_does():
     ("words", "said"),
     [
         (["--star", "Vega", "--radec", "1,2,3"], "one of --radec RA,DEC,ROLL, --star NAME"),
+        (["--radec", "vega"], "--radec vega: is a star; write --star vega"),
+        (["--radec", "alpha Lyr"], "is a star; write --star 'alpha Lyr'"),
         (["--star", "Vga"], "--star Vga: no star has this name; did you mean Vega?"),
         (["--star", "Vega,up"], "write NAME,ROLL in degrees, such as Vega,30"),
         (["--radec", "5h36m14s", "-1d12m", "0"], "write --radec 5h36m14s,-1d12m,0"),

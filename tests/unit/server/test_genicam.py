@@ -154,6 +154,28 @@ def test_a_camera_is_listed_set_and_read_in_every_format_it_has():
 
 
 @needs_aravis
+def test_a_camera_that_is_let_go_can_be_set_by_the_next_at_once():
+    with running_camera() as address:
+        for gain_db in (1.0, 2.0, 3.0):
+            with GenicamCamera(address) as camera:
+                camera.set({"Gain": gain_db})
+                camera.grab(0.01)
+
+
+@needs_aravis
+def test_a_camera_in_the_middle_of_an_exposure_is_left_soon():
+    with running_camera() as address:
+        camera = GenicamCamera(address)
+        camera.set({"TriggerMode": "On"})  # nobody takes its trigger: no image comes
+        camera.begin(30.0)
+        begun_s = time.monotonic()
+        camera.close()
+        camera.close()
+        # far below the exposure's 60 s
+        assert time.monotonic() - begun_s < 30.0
+
+
+@needs_aravis
 def test_an_image_has_the_time_at_which_its_exposure_began():
     with running_camera() as address, GenicamCamera(address) as camera:
         before_ns = time.time_ns()

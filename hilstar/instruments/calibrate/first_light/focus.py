@@ -156,16 +156,16 @@ def sharpness(
     settings = CentroidSettings(
         threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5
     )
-    found = find_stars(image, settings, background)
-    if len(found) < MIN_DOTS:
+    centroids = find_stars(image, settings, background)
+    if len(centroids) < MIN_DOTS:
         raise InputError(
-            f"{len(found)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look"
-            " at the focus"
+            f"{len(centroids)} dots are in the image and {MIN_DOTS} are needed; expose longer, or"
+            " look at the focus"
         )
     turn = math.radians(turn_deg)
     half_side = dot_side_px / 2 * (abs(math.cos(turn)) + abs(math.sin(turn)))
     # The wings of a first look at the dots: the blob's pixels are those above the threshold.
-    blob_px = math.sqrt(float(np.median(found.pixels)) / math.pi)
+    blob_px = math.sqrt(float(np.median(centroids.pixels)) / math.pi)
     half = int(
         np.clip(
             math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX
@@ -175,7 +175,7 @@ def sharpness(
     # says so.
     smallest = math.ceil(half_side + MIN_WINGS_PX)
     while True:
-        dots = _alone(image, background.level, found.x_px, found.y_px, half)
+        dots = _alone(image, background.level, centroids.x_px, centroids.y_px, half)
         if len(dots.values) >= MIN_ALONE_DOTS or half <= smallest:
             break
         half -= 1

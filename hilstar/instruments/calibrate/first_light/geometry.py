@@ -164,7 +164,9 @@ class SeenFigure:
 
     @property
     def whole_turn_deg(self) -> float:
-        """The turn that is left, with the quarter turn of an orientation that is not upright."""
+        """The turn of the screen in the tracker's image, degrees: the quarter turns of its
+        orientation and the remaining angle.
+        """
         return self.turn_deg + QUARTER_TURNS_DEG.get(self.way, 0.0)
 
 

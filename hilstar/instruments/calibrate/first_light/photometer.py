@@ -91,7 +91,7 @@ class DotField:
         return in_channel(codes, patch.channel)
 
     def lit(self, period: int) -> int:
-        """The number of lit pixels of such a lattice."""
+        """The number of lit pixels of a lattice of this period."""
         return (self.side // period) ** 2
 
 

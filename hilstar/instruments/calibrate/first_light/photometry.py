@@ -216,8 +216,8 @@ def _response_figures(
 
 
 def rounds_alike(detector: DetectorSettings) -> bool:
-    """Whether an ADC takes light of under half a DN away: nothing but enough read noise spreads
-    it over the steps.
+    """Whether the read noise is too small to spread light of under half a DN over codes: the ADC
+    then rounds all of it to none.
     """
     return detector.read_noise_e < DITHER_DN * detector.gain_e_per_dn
 

@@ -514,7 +514,7 @@ def _codes_mag(
         part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
         wanted = float(frame.linear[part].sum(dtype=np.float64))
         # In the window alone: light of a whole 8K screen is 0.3 GB, and here were three of them.
-        shown = np.mean([_light_in(each, bench.panel, part) for each in levels])
+        shown = np.mean([_light_in(channel_levels, bench.panel, part) for channel_levels in levels])
         off.append(magnitude(float(shown) / wanted) if wanted > 0 else 0.0)
     # such a star is not shown, and will not be found
     return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))

@@ -56,6 +56,7 @@ MS_PER_S = 1000.0
 PROGRESS_S = 3.0
 BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
+STEPS_FILE = Path(__file__).with_name("steps.toml")
 
 
 def latency(context: StepContext) -> StepOutcome:
@@ -174,7 +175,6 @@ class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str = ""
 
 
-STEPS_FILE = Path(__file__).with_name("steps.toml")
 STEPS = tuple(
     msgspec.structs.replace(step, name=name)
     for name, step in msgspec.toml.decode(

@@ -368,48 +368,47 @@ def scale(context: StepContext) -> StepOutcome:
         * context.file.config.tracker.detector.gain_e_per_dn
         / (wanted * context.exposure_s)
     )
-    found = scale_of(white, ratios, noise_mag)
+    star_scale = scale_of(white, ratios, noise_mag)
     scatter = stars_seen.scatter(np.asarray(magnitude(ratios)), used)
-    by_mag = float(magnitude(found.flux_at_white_e_per_s / white))
+    by_mag = float(magnitude(star_scale.flux_at_white_e_per_s / white))
     # The ADC rounds all stars by where its one dark level is.
-    rounding_mag = found.weights @ stars_seen.rounding_mag[used] / found.weights.sum()
+    rounding_mag = star_scale.weights @ stars_seen.rounding_mag[used] / star_scale.weights.sum()
     rounding_rms_mag = float(np.sqrt((rounding_mag**2).mean()))
-    by_readings_mag = MAG_PER_RELATIVE * (found.relative_error or 0.0)
+    by_readings_mag = MAG_PER_RELATIVE * (star_scale.relative_error or 0.0)
     error_mag = math.hypot(by_readings_mag, SYSTEMATIC_MAG, rounding_rms_mag)
-    weight = np.sqrt(found.weights)
+    weight = np.sqrt(star_scale.weights)
     trend_mag, trend_error_mag = trend(wanted, np.asarray(magnitude(ratios)), weight)
     rounding_trends_mag = [trend(wanted, one, weight)[0] for one in stars_seen.rounding_mag[used].T]
     rounding_trend_mag = float(np.sqrt(np.mean(np.square(rounding_trends_mag))))
     trend_error_mag = math.hypot(trend_error_mag, rounding_trend_mag)
     figures: dict[str, Figure] = {
-        "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
+        "flux_at_white_e_per_s": star_scale.flux_at_white_e_per_s,
         "in_bench_file_e_per_s": white,
         "off_mag": by_mag,
         "error_mag": error_mag,
-        "scatter_mag": found.scatter_mag,
+        "scatter_mag": star_scale.scatter_mag,
         "trend_mag": trend_mag,
         "trend_error_mag": trend_error_mag,
         "stars": len(ratios),
     }
     if context.truth is not None:
         figures["truth_off_mag"] = magnitude(
-            found.flux_at_white_e_per_s / _white_e_per_s(context.truth)
+            star_scale.flux_at_white_e_per_s / _white_e_per_s(context.truth)
         )
     figures["scatter_error_mag"] = scatter.error_mag
     brighter = (
         f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than"
         " the bench file has it"
     )
-    line = (
-        f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
-    )
+    white_text = f"{star_scale.flux_at_white_e_per_s:.4g} e-/s"
+    line = f"white is worth {white_text}, {brighter}, by {len(ratios)} stars"
     picture = context.session / "scale.svg"
     draw_light(
         picture,
         wanted,
         magnitude(ratios),
         noise_mag,
-        f"{line}; they agree to {found.scatter_mag:.3f} mag",
+        f"{line}; they agree to {star_scale.scatter_mag:.3f} mag",
     )
     readings = context.session / READINGS_FILE
     sigma_dn = noise_mag / MAG_PER_RELATIVE * stars_seen.dn[used]
@@ -422,16 +421,18 @@ def scale(context: StepContext) -> StepOutcome:
         ),
     )
     files = (picture, readings, *stars_seen.images)
-    error_e_per_s = found.flux_at_white_e_per_s * error_mag / MAG_PER_RELATIVE
+    error_e_per_s = star_scale.flux_at_white_e_per_s * error_mag / MAG_PER_RELATIVE
     number = StepNumber(
-        found.flux_at_white_e_per_s,
+        star_scale.flux_at_white_e_per_s,
         error_e_per_s,
         "e-/s",
         "light of one pixel at white, in the tracker",
     )
     unsure_mag = max(UNSURE_MAG, FAR * scatter.error_mag)
     wrong = (
-        [f"they disagree by {found.scatter_mag:.3f} mag"] if found.scatter_mag > unsure_mag else []
+        [f"they disagree by {star_scale.scatter_mag:.3f} mag"]
+        if star_scale.scatter_mag > unsure_mag
+        else []
     )
     if error_mag > UNSURE_MAG:
         wrong.append("they are too noisy: write a longer [tracker] exposure_s")
@@ -457,7 +458,7 @@ def scale(context: StepContext) -> StepOutcome:
     line += f", but {scatter.finding}" if scatter.finding else ""
     changes = (
         *context.change(
-            "render", "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")
+            "render", "flux_at_white_e_per_s", float(f"{star_scale.flux_at_white_e_per_s:.6g}")
         ),
         *context.change(
             "certify", "flux_at_white_relative", float(f"{error_mag / MAG_PER_RELATIVE:.3g}")

@@ -130,20 +130,22 @@ def uniformity(context: StepContext) -> StepOutcome:
         np.ones(len(dots.light)) if known is None else known[dots.y, dots.x].astype(np.float64)
     )
     against = map_of(dots, dots.light / as_known, size_px)
-    found = map_of(dots, dots.light, size_px)
-    figures = _figures(context, dots, found, against)
+    light_map = map_of(dots, dots.light, size_px)
+    figures = _figures(context, dots, light_map, against)
     if against.is_even:
         # The bench file keeps its map, and the error is that map's.
         figures["map_error_mag"] = math.hypot(against.error_mag(dots.noise_mag), against.rms_mag)
-    elif found.is_even:
-        figures["map_error_mag"] = math.hypot(found.error_mag(dots.noise_mag), found.rms_mag)
+    elif light_map.is_even:
+        figures["map_error_mag"] = math.hypot(
+            light_map.error_mag(dots.noise_mag), light_map.rms_mag
+        )
     picture = context.session / "uniformity.svg"
     line = (
-        f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by"
-        f" {found.left_mag:.4f} mag"
+        f"{_said(light_map, known is not None)}; {len(dots.light)} dots differ from that by"
+        f" {light_map.left_mag:.4f} mag"
     )
     line += f" (noise {dots.noise_mag:.4f})"
-    draw_uniformity(picture, dots, found, line)
+    draw_uniformity(picture, dots, light_map, line)
     files: list[Path] = [picture, *images]
     changes: tuple[KeyChange, ...] = ()
     if against.is_even:
@@ -154,7 +156,7 @@ def uniformity(context: StepContext) -> StepOutcome:
             context.session / FILE,
         )
         grid, today = (
-            None if found.is_even else found.grid,
+            None if light_map.is_even else light_map.grid,
             datetime.datetime.now(datetime.UTC).date().isoformat(),
         )
         relative, bits = (
@@ -166,7 +168,7 @@ def uniformity(context: StepContext) -> StepOutcome:
         )
         changes = context.names("monitor", "calibration", path)
         line += "; what the tracker's own lens darkens is part of it"
-    noisy = found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
+    noisy = light_map.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
     if noisy:
         why = (
             "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the"
@@ -181,8 +183,8 @@ def uniformity(context: StepContext) -> StepOutcome:
     )
     # A finer map than the last was not tried: where dots still differ by more than their noise, it
     # may be needed.
-    ends = FittedFigure("the map's rows", found.grid.shape[0], 0.0, ROWS[-1])
-    fitted = (ends,) if found.left_mag > UNEXPLAINED * dots.noise_mag else ()
+    ends = FittedFigure("the map's rows", light_map.grid.shape[0], 0.0, ROWS[-1])
+    fitted = (ends,) if light_map.left_mag > UNEXPLAINED * dots.noise_mag else ()
     return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes, number, fitted)
 
 

@@ -630,7 +630,9 @@ def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
 
 
 def _with_whole_lens(fit: Fit) -> Fit:
-    """The same geometry as a fit of the whole lens, whose further parameters are 0."""
+    """The same geometry as a fit of BROWN_CONRADY, whose parameters are 0 where the model lacks
+    them.
+    """
     names = fit.model.names
     own_count = len(fit.model.names)
     if names == BROWN_CONRADY:

@@ -353,8 +353,8 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
     plan = calibrated.plan
     problem = calibrated.problem
     wanted = np.any(calibrated.measurable, axis=0)
-    found = np.zeros(len(plan), dtype=bool)
-    found[np.unique(calibrated.data.dot)] = True
+    is_seen = np.zeros(len(plan), dtype=bool)
+    is_seen[np.unique(calibrated.data.dot)] = True
     width, height = problem.nominal.monitor.resolution_px
     column, row = (
         np.clip((place * 3 / size).astype(int), 0, 2)
@@ -363,13 +363,13 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
     for r, vertical in enumerate(CELLS[1]):
         for c, sideways in enumerate(CELLS[0]):
             here = (column == c) & (row == r) & wanted
-            if here.sum() >= MIN_CELL_DOTS and found[here].sum() < MIN_CELL_SHARE * here.sum():
+            if here.sum() >= MIN_CELL_DOTS and is_seen[here].sum() < MIN_CELL_SHARE * here.sum():
                 if vertical == sideways:
                     part = "middle"
                 else:
                     part = f"{vertical} {sideways}"
                 raise InputError(
-                    f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part}"
+                    f"only {is_seen[here].sum()} of {here.sum()} dots were recognised in the {part}"
                     " of the screen: look for what covers or dims it, and take new frames"
                 )
 
@@ -454,8 +454,10 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
         ("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True
     ):
         values[name] = (value, sigma.get(name, 0.0))
-    own = found.fit.geometry.tracker.lens or Lens()
-    for name, value in zip(fits.TRACKER_STEPS, (*own.radial[:2], *own.tangential), strict=True):
+    tracker_lens = found.fit.geometry.tracker.lens or Lens()
+    for name, value in zip(
+        fits.TRACKER_STEPS, (*tracker_lens.radial[:2], *tracker_lens.tangential), strict=True
+    ):
         if name in found.fit.model.tracker_names:
             values[name] = (value, sigma[name])
     return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}

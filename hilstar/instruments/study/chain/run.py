@@ -157,17 +157,19 @@ def scene_line(
     """One scene: the choice of `auto`, its error and time, its place relative to the front, and
     the largest part of each.
     """
-    own = rows[auto_of(rows)]
+    auto_row = rows[auto_of(rows)]
     stands = NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
     largest = max(steps, key=lambda part: part.error_arcsec)
     longest = max(stages, key=lambda one: one.time_ms)
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
+    stars = f"{auto_row.stars} stars"
+    if auto_row.lost:
+        stars += f", {auto_row.lost} of them lost"
     return (
-        f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and"
-        f" {own.error_mag:.2g} mag off over {own.stars}"
-        f" stars{f', {own.lost} of them lost' if own.lost else ''}, in {own.time_ms:.3g} ms;"
-        f" {stands}; error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage}"
+        f"{auto_row.scene}: {AUTO} ({words(auto_row)}) is {auto_row.error_arcsec:.3g} arcsec and"
+        f" {auto_row.error_mag:.2g} mag off over {stars}, in {auto_row.time_ms:.3g} ms; {stands};"
+        f" error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage}"
         f" {share:.0%}"
     )
 

@@ -321,6 +321,13 @@ def this_machine() -> report.Machine:
     )
 
 
+def _keep_image(
+    images: dict[str, Float32Array], name: str, draw: Callable[[], Float32Array]
+) -> None:
+    """Draw a method's image, and keep it to be compared."""
+    images[name] = draw()
+
+
 class CellMeasurement(Closing):
     """One image size and star count, measured into `result`; close it to free its two GL
     contexts.
@@ -353,11 +360,12 @@ class CellMeasurement(Closing):
         }
         images: dict[str, Float32Array] = {}
         for name, draw in methods.items():
-            if (why := self._too_long(draw, budget_s)) is not None:
+            why = self._too_long(draw, budget_s)
+            if why is not None:
                 self.result.skipped.append(report.Skipped(*self.cell_key, name, why))
                 continue
             whole = partial(draw, self.sprites, self.sigma_px, self.shape)
-            works[name] = lambda name=name, whole=whole: images.update({name: whole()})  # type: ignore[misc]
+            works[name] = partial(_keep_image, images, name, whole)
         self._keep(interleaved(works, rounds, budget_s))
         ours = self._draw_linear()
         for name, image in images.items():

@@ -182,8 +182,8 @@ def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> 
 
 
 def projection(stack: ExitStack, quick: bool) -> Trials:
-    """Where stars fall, by the precision of it all: error, px, worst and rms over the stars of
-    ATTITUDES random fields.
+    """Errors of star places, px, by the number format in which they are computed: the largest and
+    the rms over the stars of ATTITUDES random fields.
     """
     del stack
     camera = ideal_monitor(demo_config())

@@ -151,7 +151,7 @@ def other_sensor(tables: dict[str, Any], name: str) -> OtherSensor:
         gone.add("principal_point_px")
     optics = {key: value for key, value in tracker.items() if key not in gone}
     detector = {key: before[key] for key in OF_USE if key in before}
-    kept = [key for key in (*EFFICIENCIES, *TRACKER_KEYS[1:]) if key in optics]
+    unchanged = [key for key in (*EFFICIENCIES, *TRACKER_KEYS[1:]) if key in optics]
     beside: list[str] = []
     if EFFICIENCY not in sensor.tracker:
         beside += [key for key in WITH_EFFICIENCY if key in before]
@@ -160,18 +160,18 @@ def other_sensor(tables: dict[str, Any], name: str) -> OtherSensor:
         stated = _as_stated(figure, before)
         if figure in sensor.detector or not stated:
             continue
-        kept.append(f"{DETECTOR}.{list(stated)[-1]}")
+        unchanged.append(f"{DETECTOR}.{list(stated)[-1]}")
         belonging = _belonging(figure, before)
         beside += [key for key in belonging if key in before or key in sensor.detector]
         detector.update(belonging | stated)
-    beside = [key for key in beside if f"{DETECTOR}.{key}" not in kept]
+    beside = [key for key in beside if f"{DETECTOR}.{key}" not in unchanged]
     replaced = {*detector, *sensor.detector}
     lost = [key for key in before if key not in replaced]
     dropped = [key for key in ("principal_point_px",) if key in tracker and key not in optics]
     dropped += [f"{DETECTOR}.{key}" for key in lost if _matters(key, before)]
     changed = {**optics, SENSOR: sensor.name, DETECTOR: detector}
     of_detector = [f"{DETECTOR}.{key}" for key in beside]
-    return OtherSensor({**tables, "tracker": changed}, kept, of_detector, dropped)
+    return OtherSensor({**tables, "tracker": changed}, unchanged, of_detector, dropped)
 
 
 def _as_stated(figure: str, detector: dict[str, Any]) -> dict[str, Any]:

@@ -77,6 +77,7 @@ MAX_DRAINED_BYTES = 64_000_000
 BODY_S = 5.0
 STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
 ORDERED_S = 30.0  # a ledger on a slow disk
+PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 
 
 class Refused(Exception):
@@ -277,8 +278,6 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
     ):
         yield GaugeMetricFamily(f"hilstar_tracker_{name}", help_text, value=float(bool(trouble)))
 
-
-PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 
 Give = Callable[[Order], Awaitable[OrderAnswer]]
 

@@ -194,7 +194,7 @@ def test_a_sender_that_vanishes_is_counted_and_told_once_and_heard_again_when_it
         far.come()
         if far.cut:
             wait_for(
-                lambda round_=round_: not ends.read() and link.reconnects == round_, "the road"
+                lambda round_=round_: not ends.read() and link.reconnects >= round_, "the road"
             )
             # a line's other end begins a frame anew, too
             assert far.came_back() == (b"\0" if far.two_way else b"")
@@ -202,7 +202,9 @@ def test_a_sender_that_vanishes_is_counted_and_told_once_and_heard_again_when_it
             assert ends.numbers([first]) == [ends.next_number - 1]
         numbers = ends.numbers(ends.open())
         assert numbers == list(range(numbers[0], ends.next_number))
-        assert link.reconnects == link.link_counts.lost == far.loses * round_
+        assert link.link_counts.lost == far.loses * round_
+        # On a busy machine ZeroMQ's road connects anew beside libzmq, which is a connection more.
+        assert link.reconnects >= far.loses * round_
         assert noticed(ends.notices, {"lost", "back"}) == (
             {"lost": round_, "back": round_} if far.loses else {}
         )

@@ -64,6 +64,7 @@ def by_file(
 def budget(ledger: Path, telemetry: Path | None = None) -> tuple[dict[str, Any], list[str]]:
     """The budget and its notes without the page, which takes half of the command's time."""
     found = assess_files(ledger, telemetry, AssessSettings(display_attitudes=0))
+    assert repr(found).startswith(f"<hilstar assessment: {len(found.t_s)} answers, noise ")
     return msgspec.json.decode(msgspec.json.encode(report.budget_of(found))), found.notes
 
 

@@ -29,11 +29,12 @@ from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.sky.synthetic import colours
 from hilstar.sky.table_reader import G_LESS_I, G_LESS_V, GAIA_RANGE_MAG
 from tests.support.benches import bench_text
+from tests.support.claims import holds
 
 # Riello et al. 2021 (A&A 649, A3, table C.2) have 0.030 mag of scatter about G - V and 0.038 about
 # G - I of BP - RP. Measured: 0.010 and 0.029 mag by colour (median, 95 %), 0.015 and 0.033 by type,
 # from V-I = 0 to 2.5.
-G_MEDIAN_MAG, G_P95_MAG = 0.02, 0.045
+G_MEDIAN_MAG = 0.02
 # B of Landolt-class ground photometry (source G): B-V has no part in cool stars' spectra. Measured:
 # 0.043 and 0.119 mag.
 B_MEDIAN_MAG, B_P95_MAG = 0.06, 0.15
@@ -68,7 +69,7 @@ def test_gaia_s_g_follows_the_published_relation(bench, spectrum):
     )
     off = np.abs(found - np.interp(stars.vi_mag, v_less_i, g_less_v))[kept]
     assert np.median(off) < G_MEDIAN_MAG
-    assert np.percentile(off, 95) < G_P95_MAG
+    holds("gaia-g", np.percentile(off, 95))
 
 
 def test_b_is_that_of_ground_photometry(bench):

@@ -16,13 +16,14 @@ import pytest
 from astropy.coordinates import AltAz, EarthLocation, SkyCoord
 from astropy.time import Time
 from astropy.utils import iers
+from msgspec import structs
 from scipy.optimize import brentq
 
 from hilstar.attitude.logs.earth import q_icrs_to_enu
 from hilstar.basics.rotation import from_radec_roll_deg, rotate
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import bench_file_of
-from hilstar.server.bench.site import site_glow_e_per_s_sr
+from hilstar.server.bench.site import Ground, site_glow_e_per_s_sr, site_refraction
 from hilstar.server.bench.star_light import bench_sources, bench_stars, site_air
 from hilstar.server.bench.star_rates import bench_channels
 from hilstar.sky.air import air_mass, extinction_curve, scintillation
@@ -360,3 +361,24 @@ def test_the_benchs_hash_covers_the_sites_curves(tmp_path):
     before = bench(tmp_path, keys).sha256
     curve.write_text("wavelength_nm,value\n400,0.5\n900,0.1\n")
     assert bench(tmp_path, keys).sha256 != before
+
+
+def test_a_place_on_the_ground_moves_east_as_the_earth_turns():
+    """Its velocity is the slope of its place, 0.326 km/s at 45.5 degrees."""
+    ground = Ground(bench(Path()).config.site)
+    utc_ns = 1_790_000_000 * 10**9
+    velocity = ground.state(utc_ns)[1]
+    after, before = (ground.state(utc_ns + s * 10**9)[0] for s in (5, -5))
+    np.testing.assert_allclose(velocity, (after - before) / 10, atol=1e-4)
+    assert np.linalg.norm(velocity) == pytest.approx(0.326, abs=2e-3)
+
+
+def test_without_a_stated_pressure_it_is_the_standard_one_of_the_height():
+    """At 1200 m 877 hPa: refraction goes with it."""
+    file = bench(Path())
+    optics = bench_channels(file.config.tracker, file.folder)[0]
+    site = file.config.site
+    stated, standard = (
+        site_refraction(structs.replace(site, pressure_hpa=hpa), optics)[0] for hpa in (880.0, None)
+    )
+    assert standard / stated == pytest.approx(877.16 / 880, rel=1e-3)

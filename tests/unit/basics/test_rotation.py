@@ -138,3 +138,12 @@ def test_the_rate_between_two_attitudes_is_the_one_that_turned_them(rng, angle):
     rate = normalise(rng.normal(size=3)) * angle / 0.25
     found = rate_between_rad_s(a, propagate(a, rate, 0.25), 0.25)
     assert np.abs(found - rate).max() < 1e-13 / 0.25 + 1e-14
+
+
+def test_the_rate_between_two_attitudes_is_that_of_the_shorter_way(rng):
+    """-q is the attitude of q."""
+    q = normalise(rng.normal(size=4))
+    rate = np.array([0.01, -0.02, 0.03])
+    later = propagate(q, rate, 2.0)
+    for sign in (1, -1):
+        np.testing.assert_allclose(rate_between_rad_s(q, sign * later, 2.0), rate, atol=1e-12)

@@ -166,3 +166,19 @@ def test_more_sprites_than_the_bound_are_made_fewer_with_their_light_kept(monkey
     ]
     # paths end at the image's edge, a node more or less
     assert light[1] == pytest.approx(light[0], rel=0.02)
+
+
+def test_the_same_turn_is_drawn_alike_however_long_it_takes():
+    """A tenth of the time at ten times the rate: the same path of the same light."""
+    slow = motion((0.05, -0.1, 0.3))
+    fast = motion((0.5, -1.0, 3.0), exposure_s=0.1)
+    drawn = []
+    for at in (slow, fast):
+        stars = star_on((200.3, 90.6), at, 1e6)
+        drawn.append(smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA)))
+    assert len(drawn[0]) == len(drawn[1]) > 1
+    np.testing.assert_allclose(drawn[1].x_px, drawn[0].x_px, atol=1e-6)
+    np.testing.assert_allclose(drawn[1].y_px, drawn[0].y_px, atol=1e-6)
+    np.testing.assert_allclose(
+        drawn[1].data["electrons_per_s"], drawn[0].data["electrons_per_s"], rtol=1e-6
+    )

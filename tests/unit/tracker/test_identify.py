@@ -107,6 +107,17 @@ def test_an_expected_attitude_may_be_off_by_the_first_radius(sky, rng, off_px):
     assert known.rms_rad < 2 * NOISE_PX / FOCAL_PX  # the star that was pulled away is none of them
 
 
+def test_the_residual_s_rms_is_that_of_one_axis(sky, rng):
+    """Of 12 fields of some 20 stars: known to a twentieth; three of their numbers go to the fit."""
+    rms_px = []
+    for q in normalise(rng.normal(size=(12, 4))):
+        seen = Sky(sky, q, rng)
+        known = identify(seen.found, q, seen.near, seen.place)
+        freedom = 1 - 3 / (2 * len(known.star))
+        rms_px.append(known.rms_rad * FOCAL_PX / np.sqrt(freedom))
+    assert np.mean(rms_px) == pytest.approx(NOISE_PX, rel=0.15)
+
+
 def test_wahba_finds_the_rotation_of_weighted_directions(rng):
     q = normalise(rng.normal(size=4))
     known = normalise(rng.normal(size=(6, 3)))

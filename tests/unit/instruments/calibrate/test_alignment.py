@@ -11,6 +11,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import (
+    angle_between_rad,
     conjugate,
     from_rotation_vector,
     from_rotation_vectors,
@@ -20,7 +21,13 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.calibrate.alignment import align, groups_of, remarks_of
+from hilstar.instruments.calibrate.alignment import (
+    align,
+    corrected,
+    groups_of,
+    remarks_of,
+    residual_of,
+)
 from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs
 
 CAMERA = monitor_camera(
@@ -254,3 +261,18 @@ def test_telemetry_columns_are_named_in_the_cure(rng):
     )
     with pytest.raises(InputError, match="write qw,-qx,-qy,-qz"):
         align(pairs, CAMERA)
+
+
+def test_the_corrected_alignment_has_the_tracker_report_what_is_commanded(rng):
+    """What is shown for a command is turned by Q; a tracker that reports M more needs Q' M = Q."""
+    q, turn = normalise(rng.normal(size=(2, 4)))
+    assert angle_between_rad(multiply(corrected(q, turn), turn), q) < 1e-12
+    assert corrected(q, turn)[0] >= 0
+
+
+def test_the_residual_s_rms_has_the_freedom_that_the_rotation_took():
+    """Of two pairs a rotation takes half."""
+    commanded = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
+    off_rad = np.array([[1.0, -1.0, 2.0], [-1.0, 1.0, -2.0]]) / ARCSEC_PER_RAD
+    found = residual_of(commanded, None, off_rad, commanded[0]).rms
+    assert (found.cross, found.roll) == pytest.approx((np.sqrt(2), 2 * np.sqrt(2)))

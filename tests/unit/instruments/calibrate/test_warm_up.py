@@ -161,3 +161,21 @@ def test_no_time_constant_is_one_that_ends_what_is_tried(seed: int) -> None:
     scattered = bent * (1 + 1e-4 * np.random.default_rng(seed).standard_normal(len(t_s)))
     found = judge_warm_up(t_s, np.asarray(scattered, dtype=np.float64))
     assert found.law != "exponential" or found.tau_s < 0.98 * MAX_TAU * float(t_s[-1])
+
+
+def test_what_is_ahead_is_bounded_by_student_s_t() -> None:
+    """At 95 %, on both sides: 2.571 standard errors of 5 degrees of freedom."""
+    found = WarmUp("line", False, 0.01, ahead=-0.003, ahead_error=0.001, dof=5)
+    assert found.bound == pytest.approx(0.003 + 2.5706e-3, abs=1e-6)
+
+
+def test_a_reading_stands_in_the_middle_of_the_time_that_it_takes() -> None:
+    clock = FakeClock()
+
+    def read() -> float:
+        clock.sleep(4.0)
+        return 100.0
+
+    t_s, _ = watch_white(read, clock.now_ns, clock.sleep, 400.0)
+    assert t_s[0] == pytest.approx(2.0)
+    assert np.diff(t_s).max() < 30.0

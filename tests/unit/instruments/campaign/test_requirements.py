@@ -16,6 +16,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.cases import looking_q
+from hilstar.instruments.campaign.figures import BoundedFigure
 from hilstar.instruments.campaign.plan import Attitudes, Require, parse_plan
 from hilstar.instruments.campaign.requirements import (
     MET,
@@ -24,6 +25,7 @@ from hilstar.instruments.campaign.requirements import (
     RequirementVerdict,
     chosen_cases,
     clopper_pearson,
+    judged_figure,
     quantile_limits,
     verdicts_of,
 )
@@ -240,3 +242,16 @@ def test_a_condition_chooses_cases(rng: np.random.Generator) -> None:
 def test_a_requirement_that_cannot_be_is_refused(keys: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         parse_plan(Path("plan.toml"), f'bench = "b.toml"\ncases = 9\n[[require]]\n{keys}\n')
+
+
+@pytest.mark.parametrize(
+    ("axis", "high", "wanted"),
+    [("cross", 6.9, MET), ("cross", 7.1, NOT_SHOWN), ("roll", 3.1, NOT_SHOWN)],
+)
+def test_a_limit_is_narrowed_by_what_the_bench_itself_could_have_made(axis, high, wanted):
+    """Of a limit of 10 arcsec 3 across the boresight are the bench's, and 7 about it."""
+    require = Require(quantity="bias", axis=axis, maximum=10.0)
+    figure = BoundedFigure(1.0, 0.5, high, 50, "planted")
+    found = judged_figure(require, figure, (3.0, 7.0))
+    assert found.verdict == wanted
+    assert found.margin == pytest.approx(10.0 - (3.0 if axis == "cross" else 7.0) - high)

@@ -486,3 +486,15 @@ def test_what_budget_has_no_use_for_is_refused(bench_file):
         "leave out --centroider",
     )
     assert_refused(run_hilstar_here("budget", bench_file, "--noise", "--radec", "84"), 2, "--radec")
+
+
+def test_the_pixels_response_adds_noise_in_proportion_to_it_and_to_the_light():
+    """A star in one pixel would have all of it; one over several has less."""
+    found = []
+    for prnu in (0.0, 0.0005, 0.001):
+        detector = DetectorSettings(prnu=prnu, read_noise_e=20.0)
+        star = NoisyStar(GaussianPsf((0.8, 0.8)), detector, 0.1, phases=2)
+        found.append(star.noise(np.array([2e4]), np.zeros(1), CentroidSettings())["prnu_e"][0])
+    assert found[0] == 0
+    assert 0.2 * 0.001 * 2e4 < found[2] < 0.001 * 2e4
+    assert found[2] == pytest.approx(2 * found[1], rel=0.01)

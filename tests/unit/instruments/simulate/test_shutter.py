@@ -12,7 +12,7 @@ from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
-from hilstar.instruments.simulate.shutter import rolled
+from hilstar.instruments.simulate.shutter import RowBeat, rolled
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.exposure_motion import Motion
@@ -254,3 +254,14 @@ def test_a_wrong_shutter_is_one_line(tmp_path, keys, said):
     assert done.returncode == 2
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("hold_s", [0.004, 0.01])
+def test_the_frames_of_an_exposure_of_whole_refreshes_have_all_of_its_light(hold_s):
+    """Of a screen whose rows flash, or are lit all the time."""
+    period_s = 0.01
+    rows = Scan((0, 1), 0.02, 3 * period_s)
+    beat = RowBeat(rows, Scan((0, 1), 0.009, hold_s), period_s, phase_s=0.0013)
+    screen_s, row_s = np.array([-0.0045, 0.0, 0.0045]), np.array([-0.01, 0.0031, 0.01])
+    shares = sum(beat.shares(frame, screen_s, row_s) for frame in beat.frames)
+    np.testing.assert_allclose(shares, 1.0, rtol=1e-12)

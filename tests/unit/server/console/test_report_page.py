@@ -256,6 +256,15 @@ def test_bins_keep_every_count_whatever_the_times():
     assert (rates_hz * bins.width_ns / 1e9).sum() == pytest.approx(5)
 
 
+def test_a_steady_stream_has_a_steady_rate_however_long_it_lasts():
+    bins = TimeBins(1, capacity=8)
+    for second in range(200):
+        bins.add(np.array([second * 10**9]), np.array([0]))
+    _, rates_hz = bins.rates_hz(0)
+    assert (rates_hz[:-1] == 1.0).all()
+    assert (rates_hz * bins.width_ns / 1e9).sum() == pytest.approx(200)
+
+
 def test_of_a_flood_of_events_the_first_and_the_last_are_told():
     figures = RunFigures({})
     figures.add(frame(0))

@@ -19,6 +19,7 @@ from hilstar.server.console.scpi import (
     NotScpi,
     ScpiError,
     Unit,
+    _parameter,
 )
 from hilstar.server.console.server.scpi_server import BARE, COMMANDS, HEADERS, QUERIES
 
@@ -369,3 +370,9 @@ def test_a_device_s_own_headers_may_leave_out_what_stands_in_brackets():
     assert [next(headers.units(line)).pattern for line in ("SOUR:POW 1", "source:sky:power 1")] == [
         "SOURce[:SKY]:POWer"
     ] * 2
+
+
+@pytest.mark.parametrize("text", ["#H1F", "#h1f", "#Q37", "#B11111", "31"])
+def test_a_whole_number_is_read_to_its_base(text):
+    parameter = _parameter(text)
+    assert (parameter.kind, float(parameter.text)) == ("number", 31.0)

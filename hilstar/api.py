@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.attitudes import (
+    is_place,
     path_of,
     quaternion_of,
     rate_of,
@@ -233,6 +234,16 @@ def _check_faults(faults: object) -> None:
         raise InputError(f"faults {shortened(repr(faults))}: {FAULTS_FORM}")
 
 
+def _check_roll(attitude: object, roll_deg: object, number: object, name: str) -> None:
+    """Raise InputError for a frame's number beside a place without roll: it may be meant as one."""
+    is_first = isinstance(number, (int, np.integer)) and number == 0
+    if is_place(attitude) and roll_deg is None and not is_first:
+        raise InputError(
+            f"{name} {shortened(repr(number))} beside a SkyCoord: write the roll as roll_deg=...,"
+            " 0 too"
+        )
+
+
 def _unit_quaternion(q_icrs_to_cam: FloatArray) -> FloatArray:
     """A quaternion as it was given where its norm is 1, as its last bits choose between codes that
     are as good; else normalised. Raises InputError as `checked_quaternion`.
@@ -282,6 +293,7 @@ class OpenBench(Bench):
         """
         self._refuse_closed("frame")
         _check_faults(faults)
+        _check_roll(q_icrs_to_cam, roll_deg, number, "number")
         drawn = super().frame(
             quaternion_of(q_icrs_to_cam, roll_deg),
             whole_of(number, "number"),
@@ -314,6 +326,7 @@ class OpenBench(Bench):
         self._refuse_closed("draw")
         if q_icrs_to_cam is None and roll_deg is not None:
             raise InputError("draw: a blank frame has no roll; leave roll_deg out")
+        _check_roll(q_icrs_to_cam, roll_deg, frame, "frame")
         q = None
         if q_icrs_to_cam is not None:
             q = _unit_quaternion(quaternion_of(q_icrs_to_cam, roll_deg))

@@ -46,12 +46,11 @@ def quaternion_of(attitude: Any, roll_deg: Any = None) -> FloatArray:
     v_cam. A SkyCoord is the boresight, with `roll_deg`, 0 by default, a number or a quantity.
     Raises InputError for anything else.
     """
-    module = type(attitude).__module__
-    if module.startswith("astropy.coordinates"):
+    if is_place(attitude):
         return _of_boresight(attitude, roll_deg)
     if roll_deg is not None:
         raise InputError(NO_ROLL)
-    if module.startswith("scipy.spatial"):
+    if type(attitude).__module__.startswith("scipy.spatial"):
         scalar_last = np.asarray(attitude.as_quat(), dtype=np.float64)
         if scalar_last.shape != (4,):
             raise InputError(
@@ -66,6 +65,11 @@ def quaternion_of(attitude: Any, roll_deg: Any = None) -> FloatArray:
     if array.shape != (4,):
         raise InputError(f"attitude of shape {array.shape}: {FOUR_NUMBERS}")
     return array
+
+
+def is_place(attitude: object) -> bool:
+    """Whether an attitude is a place of Astropy, such as a SkyCoord, which has no roll."""
+    return type(attitude).__module__.startswith("astropy.coordinates")
 
 
 def quaternions_of(attitudes: Any, name: str) -> FloatArray:

@@ -7,6 +7,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import sys
 from collections.abc import Mapping
 from itertools import pairwise, takewhile
@@ -125,7 +126,7 @@ def usage_line(error: Any, words: list[str]) -> str:
     )
     at = getattr(error, "ctx", None)
     see = f"(see {'hilstar' if at is None else at.command_path} --help)"
-    if (spaced := _spaced_numbers(words)) is not None:
+    if (spaced := _spaced_numbers(words) or _spaced_star(words)) is not None:
         return spaced
     if message.startswith("Missing option") and (missing := _missing_file(words)) is not None:
         return f"{missing}: no such file; give one that is there {see}"
@@ -143,9 +144,9 @@ def usage_line(error: Any, words: list[str]) -> str:
             for name in (*parameter.opts, *parameter.secondary_opts):
                 if name.startswith("-"):
                     known.append(name)
-        advice = (
-            did_you_mean(error.option_name, known).strip() or f"its options are {', '.join(known)}"
-        )
+        # a group's own options are those of its commands
+        listed = f"its options are {', '.join(known)}" if known else "write it after a command"
+        advice = did_you_mean(error.option_name, known).strip() or listed
         return f"No such option: {shortened(error.option_name)}; {advice} {see}"
     if choice := re.search(r"'([^']*)' is not one of (.*)", message):
         meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2])).strip()
@@ -185,6 +186,21 @@ def _spaced_numbers(words: list[str]) -> str | None:
                 f"{option} {' '.join(parts)}: write {option} {numbers}, with commas and without"
                 " spaces"
             )
+    return None
+
+
+def _spaced_star(words: list[str]) -> str | None:
+    """The line for a star whose name has a space and no quotes, such as --star alpha Lyr; None if
+    there is none.
+    """
+    from hilstar.sky.named_stars import is_star
+
+    for k, word in enumerate(words):
+        option, is_joined, first = word.partition("=")
+        rest = ([first] if is_joined else []) + words[k + 1 :]
+        name = " ".join(rest[:2])
+        if option == "--star" and len(rest) > 1 and is_star(name.partition(",")[0]):
+            return f"--star {name}: write --star {shlex.quote(name)}, with quotes around the name"
     return None
 
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from typer import Argument
 
+from hilstar.basics.errors import InputError
 from hilstar.cli.completion import offered
 
 
@@ -26,6 +27,13 @@ def help_(
     ] = None,
 ) -> None:
     """Show what a command does, and its options, as its --help does."""
-    from hilstar.cli.app import run
+    from hilstar.cli.app import GROUPS, run
 
-    run([*(command or []), "--help"])
+    words = command or []
+    commands_named = 2 if words and words[0] in GROUPS else 1
+    if len(words) > commands_named:
+        named = " ".join(words[:commands_named])
+        raise InputError(
+            f"help {' '.join(words)}: names several commands; write hilstar help {named}"
+        )
+    run([*words, "--help"])

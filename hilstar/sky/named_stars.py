@@ -28,6 +28,11 @@ def hip_named(text: str) -> int | None:
     return _numbers().get(_plain(text))
 
 
+def is_star(text: str) -> bool:
+    """Whether a text is a star's name or designation, or has the form of a Hipparcos number."""
+    return NUMBER.fullmatch(text.strip()) is not None or hip_named(text) is not None
+
+
 def hip_of(text: str) -> int:
     """The Hipparcos number that a text is or names: "91262", "HIP 91262", "Vega". Raises
     InputError for a name that no star has.

@@ -7,6 +7,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from scipy.spatial.transform import Rotation
 
 import hilstar
@@ -25,6 +26,7 @@ TABLES = {
     "collimator": {"focal_length_mm": 350},
 }
 Q = [0.6987226, 0.7135120, -0.0370377, 0.0362700]
+PLACE = SkyCoord(84.057, -1.2, unit="deg")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +74,9 @@ def test_what_is_no_attitude(bench, attitude, said):
         (lambda bench: bench.frame(Q, faults="faults.toml"), "hilstar frame --scenario FILE.toml"),
         (lambda bench: bench.frame(Q, t_ns=1.5), "t_ns 1.5: write whole nanoseconds"),
         (lambda bench: bench.frame(Q, roll_deg=3), "roll_deg: is for a SkyCoord"),
+        (lambda bench: bench.frame(PLACE, 30), "number 30 beside a SkyCoord: write the roll as"),
+        (lambda bench: bench.draw(PLACE, 30), "frame 30 beside a SkyCoord: write the roll as"),
+        (lambda bench: bench.frame(PLACE, 3 * u.deg), "number <Quantity 3. deg> beside a SkyC"),
         (lambda bench: bench.draw(Q, rate_cam_rad_s=[1, 2, 3] * u.deg), "in deg: write three"),
         (lambda bench: bench.simulate(Q, noise="some"), "noise 'some': write full or none"),
         (lambda bench: bench.simulate(Q, seed=-1), "seed -1: write a whole number from 0 on"),
@@ -83,6 +88,11 @@ def test_what_is_no_attitude(bench, attitude, said):
 def test_a_bench_asked_wrongly(bench, mistake, said):
     with refused(said):
         mistake(bench)
+
+
+def test_a_frame_has_its_number_beside_a_roll(bench):
+    assert bench.frame(PLACE, 3, roll_deg=0).q_icrs_to_cam == pytest.approx(Q, abs=1e-6)
+    assert bench.draw(PLACE, 3, roll_deg=0).levels.shape == (54, 96)
 
 
 @pytest.mark.parametrize("what", ["frame", "draw", "simulate"])

@@ -72,6 +72,12 @@ def test_help_of_no_command_says_which_was_meant(tmp_path):
     assert_refused(run_hilstar_here("help", "fram", cwd=tmp_path), 2, "did you mean frame?")
 
 
+@pytest.mark.parametrize("words", [["frame", "verify"], ["calibrate", "dots", "psf"]], ids=" ".join)
+def test_help_of_several_commands_is_refused(words, tmp_path):
+    done = run_hilstar_here("help", *words, cwd=tmp_path)
+    assert_refused(done, 2, f"names several commands; write hilstar help {' '.join(words[:-1])}")
+
+
 def test_the_version_is_the_package_s(capsys):
     assert not run(["--version"])
     assert capsys.readouterr().out == f"hilstar {hilstar.__version__}\n"

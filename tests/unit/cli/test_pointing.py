@@ -63,6 +63,7 @@ def test_numbers_are_degrees():
         ("5h36m,-1d12m", "write RA,DEC,ROLL in degrees"),
         ("Orion,-1d12m,0", "write RA,DEC,ROLL in degrees"),
         ("nan,1d,0", "write RA,DEC,ROLL in degrees"),
+        ("-1d12m,5h36m14s,0", "write RA,DEC,ROLL in degrees"),
     ],
 )
 def test_a_place_that_is_none_is_refused(text, said):

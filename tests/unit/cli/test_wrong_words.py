@@ -39,6 +39,11 @@ MEANT = "84.057,-1.2,0, with commas and without spaces"
             ["frame", BENCH, "--radec", "84.057 -1.2 0", "-o", "o.fits"],
             "with commas and without spaces",
         ),
+        (["frame", BENCH, "--star", "alpha", "Lyr", "-o", "o.fits"], "write --star 'alpha Lyr'"),
+        (["frame", "--star", "Proxima", "Centauri,30", BENCH], "--star 'Proxima Centauri,30'"),
+        (["frame", BENCH, "--star=HIP", "27989", "-o", "o.fits"], "write --star 'HIP 27989'"),
+        (["frame", BENCH, "--star", "Vega", "spare"], "unexpected extra argument(s) (spare)"),
+        (["calibrate", "--nonsense"], "No such option: --nonsense; write it after a command"),
         (
             ["simulate", BENCH, "--radec", "1,2,3", "--slew", "0", "1", "0", "-o", "o.fits"],
             "write --slew 0,1,0",

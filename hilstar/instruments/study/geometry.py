@@ -92,18 +92,18 @@ def observed_dots(
     width, height = resolution_px
     inside = (x_px > 0) & (x_px < width - 1) & (y_px > 0) & (y_px < height - 1)
 
-    def measured(places: FloatArray, false_count: int, size: int) -> FloatArray:
+    def noisy_px(places: FloatArray, false_count: int, size: int) -> FloatArray:
         """Places along an axis with their noise, and false ones anywhere."""
-        noisy = places + rng.normal(0, faults.noise_px, len(places))
-        return np.concatenate([noisy, rng.uniform(0, size, false_count)])
+        scattered = places + rng.normal(0, faults.noise_px, len(places))
+        return np.concatenate([scattered, rng.uniform(0, size, false_count)])
 
     centroids: list[FloatArray] = []
     for frame in range(plan.frames):
         dots = np.flatnonzero(plan.lit[:, frame] & inside)
         dots = dots[rng.uniform(size=len(dots)) >= faults.lost]
         false_count = int(rng.poisson(faults.false * len(dots)))
-        x = measured(x_px[dots], false_count, width)
-        y = measured(y_px[dots], false_count, height)
+        x = noisy_px(x_px[dots], false_count, width)
+        y = noisy_px(y_px[dots], false_count, height)
         centroids.append(np.stack([np.full(len(x), float(frame)), x, y]))
     frames, x, y = np.concatenate(centroids, axis=1)
     frame_of = frames.astype(np.intp)

@@ -75,9 +75,22 @@ class GoldenFrames:
         The name is `golden`, or that of the test. With --update-golden a frame that differs, or
         has no golden one, is written as the golden one, with its truth beside it.
         """
+        from hilstar.api import SkyFrame
+        from hilstar.basics.errors import shortened
         from hilstar.instruments.compare import assert_same_sky
 
         __tracebackhide__ = True
+        if golden is not None and not isinstance(golden, str):
+            pytest.fail(
+                f"golden {shortened(repr(golden))}: write the golden frame's name, after the frame",
+                pytrace=False,
+            )
+        if self.update and not isinstance(frame, SkyFrame):
+            pytest.fail(
+                f"frame {shortened(repr(frame))}: golden frames are written of what"
+                " hilstar_bench.frame(...) returns",
+                pytrace=False,
+            )
         image = self._path(golden)
         truth = image.with_suffix(".csv")
         limits: dict[str, Any] = {"flux_mag": flux_mag, "centroid_px": centroid_px}

@@ -45,6 +45,11 @@ __all__ = [
     "turn_text",
 ]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 

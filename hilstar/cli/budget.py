@@ -52,7 +52,7 @@ def budget(
             "--sensor",
             metavar="NAME",
             autocompletion=offered(sensor_names),
-            help="Whether this sensor (imx250, ...) behind the bench's lens is sensitive enough.",
+            help="Whether this sensor (cmv4000, ...) behind the bench's lens is sensitive enough.",
         ),
     ] = None,
     as_json: Json = False,

@@ -149,6 +149,11 @@ def wanted_samples(
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.server.send_log import log_samples, spin_samples
 
+    if log is None and spin is None and place is not None:
+        raise InputError(
+            "send: --radec and --star say where a --spin begins; add --spin AXIS,DEG_PER_S, such"
+            " as --spin z,0 for an attitude at rest"
+        )
     if (log is None) == (spin is None):
         raise InputError("send: give either a LOG or --spin AXIS,DEG_PER_S")
     if rate is not None and not 1e-3 <= rate <= 10_000:

@@ -4,6 +4,7 @@ Names and designations are those of `star_names`: 3300 stars, whose letters are 
 A person may spell the letter out ("alpha Ori"), and write capitals or not.
 """
 
+import math
 import re
 import unicodedata
 from functools import cache
@@ -67,9 +68,15 @@ def star_place_deg(text: str, epoch_jyear: float) -> tuple[float, float]:
 
 @cache
 def _numbers() -> dict[str, int]:
+    """Hipparcos numbers by plain name. Two stars may have one designation, as those of a double
+    have: the brighter is meant.
+    """
+    names, catalog = star_names(), load_catalog()
+    rows = np.isin(catalog.hip, list(names))
+    v_mag = dict(zip(catalog.hip[rows].tolist(), catalog.v_mag[rows].tolist(), strict=True))
     numbers: dict[str, int] = {}
-    for hip, star in star_names().items():
-        for name in star:
+    for hip in sorted(names, key=lambda hip: v_mag.get(hip, math.inf)):
+        for name in names[hip]:
             if name:
                 numbers.setdefault(_plain(name), hip)
     return numbers
@@ -83,5 +90,6 @@ def _plain(text: str) -> str:
     for letter in unicodedata.normalize("NFKC", text):
         name = unicodedata.name(letter, "")
         is_greek = name.startswith("GREEK SMALL LETTER ")
-        letters.append(name.split()[3] if is_greek else letter)
+        # Unicode calls lambda "lamda"
+        letters.append(name.split()[3].replace("LAMDA", "LAMBDA") if is_greek else letter)
     return " ".join("".join(letters).casefold().split())

@@ -59,6 +59,12 @@ def test_the_public_names_are_listed_and_there():
         assert getattr(hilstar, name).__doc__
 
 
+def test_the_names_of_rotation_are_listed():
+    assert sorted(dir(hilstar.rotation)) == sorted(hilstar.rotation.__all__)
+    for name in dir(hilstar.rotation):
+        assert callable(getattr(hilstar.rotation, name))
+
+
 def test_an_attitude_is_a_quaternion_a_rotation_or_a_place_with_a_roll(bench):
     place = SkyCoord(84.057, -1.2, unit="deg")
     same = (

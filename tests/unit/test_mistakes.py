@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import astropy.units as u
@@ -121,6 +122,15 @@ def test_a_closed_bench_draws_nothing(what):
 def test_a_frame_used_wrongly(frame, mistake, said):
     with refused(said):
         mistake(frame)
+
+
+def test_an_assert_of_a_comparison_or_a_verdict_can_fail(bench, frame):
+    """`assert hilstar.compare(a, b)`, without `.same`."""
+    assert hilstar.compare(frame, frame)
+    assert not hilstar.compare(bench.frame(PLACE, roll_deg=10), frame)
+    verdict = bench.verify(1)
+    assert bool(verdict) == verdict.passed
+    assert bool(replace(verdict, reasons=[])) and not replace(verdict, reasons=["too dark"])
 
 
 @pytest.mark.parametrize(

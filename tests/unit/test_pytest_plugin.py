@@ -80,6 +80,24 @@ def test_a_missing_bench_is_one_line(project):
     assert "Traceback" not in failed.stdout
 
 
+@pytest.mark.e2e
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("'belt', hilstar_bench.frame([1, 0, 0, 0])", "write the golden frame's name, after"),
+        ("hilstar_bench.frame([1, 0, 0, 0]).linear", "golden frames are written of what"),
+    ],
+)
+def test_a_wrong_golden_frame_is_one_line(project, arguments, said):
+    text = f"def test_it(hilstar_bench, assert_same_sky):\n    assert_same_sky({arguments})\n"
+    (project / "test_sky.py").write_text(text)
+    failed = pytest_in(project, "--update-golden")
+    assert failed.returncode == 1
+    assert said in failed.stdout
+    assert "Error" not in failed.stdout
+    assert not (project / "golden").exists()
+
+
 def test_the_plugin_imports_nothing_of_hilstar_but_its_version():
     """A pytest of any project in the environment pays for the import."""
     code = "import sys, hilstar.pytest_plugin; print(*sorted(m for m in sys.modules if 'hil' in m))"

@@ -417,6 +417,9 @@ class SkyComparison:
         """Whether both images are one sky, in every channel."""
         return not self.bad and all(channel.same for channel in self.channels.values())
 
+    def __bool__(self) -> bool:
+        return self.same
+
     def __repr__(self) -> str:
         if self.same:
             return f"<hilstar comparison: the same sky, {self.star_count} stars>"

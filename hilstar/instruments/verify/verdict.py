@@ -343,6 +343,9 @@ class Verdict:
         """True without any reason against it."""
         return not self.reasons
 
+    def __bool__(self) -> bool:
+        return self.passed
+
     def __repr__(self) -> str:
         words = "passed" if self.passed else "not passed"
         counts = f"stars: {self.errors.looked_for}, reasons against it: {len(self.reasons)}"

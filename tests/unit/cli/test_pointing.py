@@ -143,6 +143,8 @@ def test_what_points_nowhere_is_refused(words, said, tmp_path):
         (["budget", DEMO, "--star", "Vega"], "budget --star: names a field of stars"),
         (["study", "faults", "--star", "Vega", "-o", "d"], "study faults: has fields of its own"),
         (["study", "models", "--star", "Vega", "-o", "d"], "BENCH.toml --star Vega"),
+        (["send", "--star", "Vega"], "add --spin AXIS,DEG_PER_S, such as --spin z,0"),
+        (["send"], "send: give either a LOG or --spin AXIS,DEG_PER_S"),
         (["send", "--spin", "z,1", "--star", "Vga"], "did you mean Vega?"),
         (["send", "--spin", "z,1", "--star", "Vega", "--radec", "1,2,3"], "leave one out"),
     ],

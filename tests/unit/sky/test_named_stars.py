@@ -43,6 +43,18 @@ def test_a_number_above_a_letter_is_written_after_it():
     assert hip_named("omicron1 CMa") == hip_named("ο¹ CMa") is not None
 
 
+def test_lambda_is_spelled_as_people_spell_it():
+    assert hip_named("lambda Ori") == hip_named("λ Ori") == 26207
+
+
+@pytest.mark.parametrize(
+    ("designation", "hip"),
+    [("alpha Cen", 71683), ("delta Cep", 110991), ("gamma Col", 28199), ("55 UMa", 55266)],
+)
+def test_a_designation_of_two_stars_is_the_brighter_ones(designation, hip):
+    assert hip_named(designation) == hip
+
+
 def test_a_name_that_no_star_has_is_answered_with_the_nearest():
     assert hip_named("sirus") is None
     with pytest.raises(InputError, match="did you mean Sirius"):

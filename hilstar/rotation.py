@@ -22,6 +22,7 @@ from hilstar.basics.attitudes import (
     seconds_of,
     share_of,
 )
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import turn_text
 
 __all__ = [
@@ -50,6 +51,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
+MAX_DEC_DEG = 90.0
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
@@ -68,7 +70,19 @@ CHECKS: dict[str, Callable[[Any, str], Any]] = {
     "seconds": seconds_of,
     "fraction": share_of,
 }
-ONE_PLACE = dict.fromkeys(("ra_deg", "dec_deg", "roll_deg"), angle_deg_of)
+
+
+def _declination_deg(value: Any, name: str) -> float:
+    dec_deg = angle_deg_of(value, name)
+    if abs(dec_deg) > MAX_DEC_DEG:
+        raise InputError(f"{name} = {dec_deg:g}: a declination is from -90 to 90; swapped with RA?")
+    return dec_deg
+
+
+ONE_PLACE = {
+    **dict.fromkeys(("ra_deg", "roll_deg"), angle_deg_of),
+    "dec_deg": _declination_deg,
+}
 
 
 def _checked(

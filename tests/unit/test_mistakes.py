@@ -201,6 +201,17 @@ def test_a_rotation_of_something_else(mistake, said):
         mistake()
 
 
+def test_a_declination_beyond_the_pole_is_refused():
+    with pytest.raises(hilstar.InputError, match="dec_deg = 95: a declination is from -90 to 90"):
+        rotation.from_radec_roll_deg(84, 95, 0)
+
+
+def test_an_exposure_is_an_array_of_its_dn(bench):
+    exposure = bench.simulate(Q)
+    assert np.array_equal(np.asarray(exposure), exposure.dn)
+    assert np.asarray(exposure).dtype == np.uint16
+
+
 def test_rotations_take_lists_scipy_and_quantities():
     q = rotation.from_radec_roll_deg(84.057 * u.deg, (-1.2 * 60) * u.arcmin, 0.0)
     assert q == pytest.approx(Q, abs=1e-7)

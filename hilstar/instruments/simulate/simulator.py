@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -121,6 +121,12 @@ class Exposure:
     truth: npt.NDArray[np.void]
     capped: int = 0
     faults: tuple[str, ...] = ()
+
+    def __array__(
+        self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
+    ) -> npt.NDArray[Any]:
+        """The DN."""
+        return np.array(self.dn, dtype=dtype, copy=copy)
 
     def __repr__(self) -> str:
         height, width = self.dn.shape

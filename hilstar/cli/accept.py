@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from typer import Option
 
-from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
 from hilstar.cli import running
-from hilstar.cli.campaign import CENTROIDS, run_cases, show_cases
+from hilstar.cli.campaign import CENTROIDS, check_through, run_cases, show_cases
 from hilstar.cli.options import BenchFile, Headless, Json
 from hilstar.server.console.terminal import print_found, say
 
@@ -91,7 +90,7 @@ def accept(
     of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
     of_bench["--feed"] = feed is not None
     of_tracker = {"--workers": workers is not None, "--solver": solver != CENTROIDS}
-    _check_options(acceptance.on_bench, of_bench, of_tracker)
+    check_through("accept", "--through", acceptance.on_bench, of_bench, of_tracker)
     acceptance.check()
     count = workers or len(os.sched_getaffinity(0))
     if dry_run:
@@ -118,14 +117,6 @@ def accept(
     print_found(as_json, summary, lines)
     if strict and verdict_of(verdicts) == NOT_MET:
         raise typer.Exit(1)
-
-
-def _check_options(on_bench: bool, of_bench: dict[str, bool], of_tracker: dict[str, bool]) -> None:
-    """Refuse (InputError) options that mean nothing for the plan's `through`."""
-    for name, given in (of_tracker if on_bench else of_bench).items():
-        if given:
-            through = "tracker or display" if on_bench else "bench"
-            raise InputError(f"accept {name}: is for --through {through}; leave it out")
 
 
 def _print_costs(acceptance: "Acceptance", workers: int, as_json: bool) -> None:

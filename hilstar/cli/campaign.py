@@ -135,7 +135,7 @@ def campaign(
     this = Campaign(plan, output, solver, solver_timeout, images is not None)
     of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
     of_bench |= {"--feed": feed is not None, "--console": console is not None}
-    _check_options(this.on_bench, of_bench, pooled)
+    check_through("campaign", "through =", this.on_bench, of_bench, pooled)
     directory = Directory(output)
     try:
         directory.claim(this.about())
@@ -179,12 +179,20 @@ def campaign(
         raise typer.Exit(1)
 
 
-def _check_options(on_bench: bool, of_bench: dict[str, bool], pooled: dict[str, bool]) -> None:
-    """Refuse (InputError) options that mean nothing for the campaign's `through`."""
-    for name, given in (pooled if on_bench else of_bench).items():
+def check_through(
+    command: str,
+    setting: str,
+    on_bench: bool,
+    of_bench: dict[str, bool],
+    of_tracker: dict[str, bool],
+) -> None:
+    """Refuse (InputError) options that mean nothing for the plan's `through`, which is written as
+    `setting` in a plan or in a command.
+    """
+    for name, given in (of_tracker if on_bench else of_bench).items():
         if given:
             through = "tracker or display" if on_bench else "bench"
-            raise InputError(f"campaign {name}: is for through = {through}; leave it out")
+            raise InputError(f"{command} {name}: is for {setting} {through}; leave it out")
 
 
 def show_cases(

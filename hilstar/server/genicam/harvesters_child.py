@@ -127,11 +127,7 @@ class HarvestersCamera:
             buffer.parent.queue_buffer(buffer)
         finally:
             self.acquirer.stop()
-        return {
-            "format": self.features.PixelFormat.value,
-            "width": size[0],
-            "height": size[1],
-            "exposure_us": self.exposure.value,
+        return self._image_facts(size) | {
             "arrived_utc_ns": arrived_ns,
             "incomplete": incomplete,
         }
@@ -163,11 +159,7 @@ class HarvestersCamera:
                     buffer.parent.queue_buffer(buffer)
         finally:
             self.acquirer.stop()
-        return {
-            "format": self.features.PixelFormat.value,
-            "width": size[0],
-            "height": size[1],
-            "exposure_us": self.exposure.value,
+        return self._image_facts(size) | {
             "frames": frames,
             "incomplete": incomplete,
         }
@@ -176,6 +168,15 @@ class HarvestersCamera:
         """Let it go at once."""
         self.acquirer.destroy()
         self.reader.reset()
+
+    def _image_facts(self, size_px: tuple[int, int]) -> dict[str, Any]:
+        """What a parent needs to read an image."""
+        return {
+            "format": self.features.PixelFormat.value,
+            "width": size_px[0],
+            "height": size_px[1],
+            "exposure_us": self.exposure.value,
+        }
 
     def _start(self, exposure_us: float) -> None:
         self.exposure.value = exposure_us

@@ -131,7 +131,7 @@ def by_number(path: Path) -> list[str | int]:
     return [int(part) if part.isdigit() else part for part in parts]
 
 
-def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> IO[bytes]:
+def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> io.BufferedReader:
     """A regular file, open for reading. `advice` is what to give instead, such as "give the path of
     a bench file".
 
@@ -182,7 +182,7 @@ class KeptFiles:
         """What the file holds, without opening it; None where it is not kept in its state."""
         state = _settled_state(path)
         with self._lock:
-            if state not in self._contents:
+            if state is None or state not in self._contents:
                 return None
             self._contents.move_to_end(state)
             return self._contents[state]
@@ -295,7 +295,7 @@ def open_lines(
     """
     content = _named.content(path)
     if content is None or len(content) > limit_bytes:
-        opened = open_regular(path, advice, limit_bytes)
+        opened: IO[bytes] = open_regular(path, advice, limit_bytes)
     else:
         opened = io.BytesIO(content)
     with opened as file:

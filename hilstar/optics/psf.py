@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache
 from itertools import count, zip_longest
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -199,8 +199,11 @@ class Psf(ABC):
         The side is odd: the footprint's, or one more.
         """
         rates = np.ones(len(x_px)) if electrons_per_s is None else electrons_per_s
-        fraction_px = np.stack([place - np.floor(place + 0.5) for place in (x_px, y_px)])
-        return np.moveaxis(self.stamps(fraction_px, rates, self.footprint_px | 1), 2, 0)
+        fraction_x = x_px - np.floor(x_px + 0.5)
+        fraction_y = y_px - np.floor(y_px + 0.5)
+        fraction_px = np.stack([fraction_x, fraction_y])
+        stamps = self.stamps(fraction_px, rates, self.footprint_px | 1)
+        return np.moveaxis(stamps, 2, 0)
 
     def image(
         self,
@@ -293,18 +296,21 @@ class GaussianPsf(Psf):
     @cached_property
     def peak_share(self) -> float:
         """The share of the pixel that a star is centred on."""
-        return pixel_share(0.0, self.sigma_px[0]) * pixel_share(0.0, self.sigma_px[1])
+        sigma_x, sigma_y = self.sigma_px
+        return pixel_share(0.0, sigma_x) * pixel_share(0.0, sigma_y)
 
     @cached_property
     def reach(self) -> Reach:
         """A Gaussian's ellipse with the factor that the integral over pixels needs."""
-        scale = [2 * (sigma**2 + 1 / 12) for sigma in self.sigma_px]
         places = np.linspace(0.0, self.footprint_px / 2 + 0.5, BOUND_PLACES)
-        shares = [np.maximum(pixel_shares(places, sigma), 1e-300) for sigma in self.sigma_px]
-        more = []
-        for share, along in zip(shares, scale, strict=True):
-            more.append(float((np.log(share) + places**2 / along).max()))
-        return Reach((scale[0], scale[1]), math.exp(sum(more)))
+        axes_px2 = []
+        log_factor = 0.0
+        for sigma in self.sigma_px:
+            axis_px2 = 2 * (sigma**2 + 1 / 12)
+            logs = np.log(np.maximum(pixel_shares(places, sigma), 1e-300))
+            axes_px2.append(axis_px2)
+            log_factor += float((logs + places**2 / axis_px2).max())
+        return Reach((axes_px2[0], axes_px2[1]), math.exp(log_factor))
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The product of the shares along both axes."""
@@ -321,12 +327,14 @@ class GaussianPsf(Psf):
         from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
         edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
-        across, down = (
-            np.diff(ndtr((edges - at) / s), axis=0)
-            for at, s in zip(fraction_px, self.sigma_px, strict=True)
-        )
+        fraction_x, fraction_y = fraction_px
+        sigma_x, sigma_y = self.sigma_px
+        across = np.diff(ndtr((edges - fraction_x) / sigma_x), axis=0)
+        down = np.diff(ndtr((edges - fraction_y) / sigma_y), axis=0)
         down *= electrons_per_s
-        return np.asarray(across.astype(np.float32)[None] * down.astype(np.float32)[:, None])
+        across_32 = across.astype(np.float32)
+        down_32 = down.astype(np.float32)
+        return np.asarray(across_32[None] * down_32[:, None])
 
     def drawn_stamps(
         self, fraction_px: Float32Array, rates: Float32Array, side_px: int, footprint_px: int
@@ -350,44 +358,47 @@ class GaussianPsf(Psf):
         from scipy.special import ndtr  # as in `stamps`
 
         left, top, width, height = region
-        across = np.diff(
-            ndtr((left - 0.5 + np.arange(width + 1) - x_px[:, None]) / self.sigma_px[0]), axis=1
-        )
-        down = np.diff(
-            ndtr((top - 0.5 + np.arange(height + 1) - y_px[:, None]) / self.sigma_px[1]), axis=1
-        )
+        sigma_x, sigma_y = self.sigma_px
+        edges_x = left - 0.5 + np.arange(width + 1)
+        edges_y = top - 0.5 + np.arange(height + 1)
+        across = np.diff(ndtr((edges_x - x_px[:, None]) / sigma_x), axis=1)
+        down = np.diff(ndtr((edges_y - y_px[:, None]) / sigma_y), axis=1)
         return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
 
     def cut_share(self, size_px: int) -> float:
         """Axis by axis, from the complements of both edges."""
         inside = 1.0
         for sigma in self.sigma_px:
-            inside_axis = 1.0 - 0.5 * sum(
-                math.erfc((size_px / 2 + side) / (sigma * SQRT2)) for side in (-0.5, 0.5)
-            )
-            inside *= inside_axis
+            beyond_near = math.erfc((size_px / 2 - 0.5) / (sigma * SQRT2))
+            beyond_far = math.erfc((size_px / 2 + 0.5) / (sigma * SQRT2))
+            inside *= 1.0 - 0.5 * (beyond_near + beyond_far)
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
         """The share of a pixel beside the middle of an edge."""
-        (x, y), beyond = self.sigma_px, size_px / 2
-        return max(
-            pixel_share(beyond, x) * pixel_share(0.0, y),
-            pixel_share(beyond, y) * pixel_share(0.0, x),
-        )
+        sigma_x, sigma_y = self.sigma_px
+        beyond_px = size_px / 2
+        beside_x = pixel_share(beyond_px, sigma_x) * pixel_share(0.0, sigma_y)
+        beside_y = pixel_share(beyond_px, sigma_y) * pixel_share(0.0, sigma_x)
+        return max(beside_x, beside_y)
 
     def shader(self, side_px: int) -> ShareShader:
         """A polynomial for each axis where one is exact enough (`share_polynomial`), else error
         functions.
         """
-        inverse_x, inverse_y = (1 / (sigma * SQRT2) for sigma in self.sigma_px)
-        uniforms = {"inverse_sigma_sqrt2": (inverse_x, inverse_y)}
-        axes = [share_polynomial(sigma, side_px / 2 + 0.5) for sigma in self.sigma_px]
-        if axes[0] is None or axes[1] is None:
+        sigma_x, sigma_y = self.sigma_px
+        uniforms = {"inverse_sigma_sqrt2": (1 / (sigma_x * SQRT2), 1 / (sigma_y * SQRT2))}
+        powers_x = share_polynomial(sigma_x, side_px / 2 + 0.5)
+        powers_y = share_polynomial(sigma_y, side_px / 2 + 0.5)
+        if powers_x is None or powers_y is None:
             return ShareShader((), uniforms)
-        terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
+        terms = []
+        for x, y in zip_longest(powers_x, powers_y, fillvalue=0.0):
+            terms.append(f"vec2({x:.9e}, {y:.9e})")
         # Written out: from an array of uniforms llvmpipe takes twice as long.
-        polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
+        polynomial = terms[-1]
+        for term in reversed(terms[:-1]):
+            polynomial = f"({polynomial} * square + {term})"
         return ShareShader((f"LOG2_SHARE(square) {polynomial}",), uniforms)
 
     def blurred(self, sigma_px: float) -> "GaussianPsf":
@@ -430,9 +441,13 @@ class SampledPsf(Psf):
             )
         # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the
         # largest of those below zero
-        phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
-        least = min(float(part.sum()) for part in phases)
-        negative = max(float(-part.clip(max=0).sum()) for part in phases)
+        least = math.inf
+        negative = 0.0
+        for y in (0, 1):
+            for x in (0, 1):
+                shares = self._halves[y::2, x::2]
+                least = min(least, float(shares.sum()))
+                negative = max(negative, float(-shares.clip(max=0).sum()))
         if negative > self.max_negative:
             raise InputError(
                 f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample"
@@ -458,25 +473,27 @@ class SampledPsf(Psf):
 
         density = self.samples / self.samples.sum() * self.per_px**2
         for axis, at_px in ((0, y_px), (1, x_px)):
-            black = [(BLACK_SAMPLES, BLACK_SAMPLES) if k == axis else (0, 0) for k in (0, 1)]
+            black = [(0, 0), (0, 0)]
+            black[axis] = (BLACK_SAMPLES, BLACK_SAMPLES)
             density = np.pad(density, black)
-            place_px = (np.arange(density.shape[axis]) - density.shape[axis] // 2) / self.per_px
+            size = density.shape[axis]
+            place_px = (np.arange(size) - size // 2) / self.per_px
             spline = make_interp_spline(place_px, density, SPLINE_DEGREE, axis=axis)
             last_px = place_px[-1]
             if self.pixel_integrated:
                 density = spline(np.clip(at_px, -last_px, last_px))
             else:
                 light = spline.antiderivative()
-                low, high = (
-                    light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5)
-                )
+                low = light(np.clip(at_px - 0.5, -last_px, last_px))
+                high = light(np.clip(at_px + 0.5, -last_px, last_px))
                 density = high - low
         return np.asarray(density)
 
     @cached_property
     def _halves(self) -> FloatArray:
         """Shares at each half pixel, far enough that the last are black."""
-        last = 2 * math.ceil((max(self.samples.shape) // 2 + BLACK_SAMPLES) / self.per_px + 1)
+        reach_samples = max(self.samples.shape) // 2 + BLACK_SAMPLES
+        last = 2 * math.ceil(reach_samples / self.per_px + 1)
         at_px = np.arange(-last, last + 1) / 2
         return self._before_cut(at_px, at_px)
 
@@ -489,15 +506,13 @@ class SampledPsf(Psf):
         # a Gaussian weight as wide as the PSF halves its variance and its distance
         for _ in range(WIDTH_ROUNDS):
             powers = at_px ** np.arange(3)[:, None]
-            across, down = (
-                powers * np.exp(-((at_px - m) ** 2) / (2 * v))
-                for m, v in zip(middle, variance, strict=True)
-            )
+            across = powers * np.exp(-((at_px - middle[0]) ** 2) / (2 * variance[0]))
+            down = powers * np.exp(-((at_px - middle[1]) ** 2) / (2 * variance[1]))
             sums = down @ self._table @ across.T  # powers of y, powers of x
-            mean = np.array([sums[0, 1], sums[1, 0]]) / sums[0, 0]
-            variance = np.maximum(
-                2 * (np.array([sums[0, 2], sums[2, 0]]) / sums[0, 0] - mean**2), PIXEL_VARIANCE
-            )
+            light = sums[0, 0]
+            mean = np.array([sums[0, 1], sums[1, 0]]) / light
+            mean_square = np.array([sums[0, 2], sums[2, 0]]) / light
+            variance = np.maximum(2 * (mean_square - mean**2), PIXEL_VARIANCE)
             middle = 2 * mean - middle
         x, y = np.sqrt(np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)).tolist()
         return x, y
@@ -510,8 +525,9 @@ class SampledPsf(Psf):
     @cached_property
     def _steps(self) -> int:
         """Places of the table to a pixel, an even number."""
-        fine = min(FINE_STEPS_A_PX, 2 * MAX_TABLE_SIDE // self.footprint_px)
-        return min(MAX_STEPS_A_PX, max(fine, MAX_TABLE_SIDE // self.footprint_px)) // 2 * 2
+        side_steps = MAX_TABLE_SIDE // self.footprint_px
+        fine_steps = min(FINE_STEPS_A_PX, 2 * MAX_TABLE_SIDE // self.footprint_px)
+        return min(MAX_STEPS_A_PX, max(fine_steps, side_steps)) // 2 * 2
 
     @cached_property
     def _table(self) -> Float32Array:
@@ -540,32 +556,36 @@ class SampledPsf(Psf):
         """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth
         of the largest.
         """
-        squares = ((np.arange(len(self._table)) - len(self._table) // 2) / self._steps) ** 2
+        at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
+        squares = at_px**2
         logs = np.log(np.maximum(self._table, 1e-30))
-
-        reaches = []
+        smallest_share_log = math.log(1e-4 * self.peak_share)
+        variance_x, variance_y = self.variance_px2
+        smallest_px2 = math.inf
         for scale in 2 * np.geomspace(1.0, 300.0, 20):
-            x, y = (float(scale) * variance for variance in self.variance_px2)
+            x, y = float(scale) * variance_x, float(scale) * variance_y
             # the table is interpolated
             log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01
-            reaches.append(
-                (scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y))
-            )
-        _, log_factor, axes_px2 = min(reaches)
-        return Reach(axes_px2, math.exp(log_factor))
+            reach_px2 = scale * (log_factor - smallest_share_log)
+            if reach_px2 < smallest_px2:
+                smallest_px2 = reach_px2
+                ellipse = Reach((x, y), math.exp(log_factor))
+        return ellipse
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Linear between the four nearest of the table; 0 beyond it."""
         last = len(self._table) - 1
-        at_x, at_y = (np.clip(at * self._steps + last / 2, 0, last) for at in (x_px, y_px))
-        column, row = (np.minimum(at.astype(np.intp), last - 1) for at in (at_x, at_y))
+        at_x = np.clip(x_px * self._steps + last / 2, 0, last)
+        at_y = np.clip(y_px * self._steps + last / 2, 0, last)
+        column = np.minimum(at_x.astype(np.intp), last - 1)
+        row = np.minimum(at_y.astype(np.intp), last - 1)
         x = at_x - column
         y = at_y - row
-        first = row * (last + 1) + column
         table = self._table.ravel()
-        above, below = (
-            (1 - x) * table[first + down] + x * table[first + down + 1] for down in (0, last + 1)
-        )
+        first = row * (last + 1) + column
+        above = (1 - x) * table[first] + x * table[first + 1]
+        first = first + (last + 1)
+        below = (1 - x) * table[first] + x * table[first + 1]
         return np.asarray((1 - y) * above + y * below)
 
     def stamps(
@@ -573,7 +593,9 @@ class SampledPsf(Psf):
     ) -> Float32Array:
         """See `Psf.stamps`: all offsets at once."""
         pixel = np.arange(side_px) - (side_px - 1) // 2
-        x, y = (pixel[:, None] - at for at in fraction_px)
+        fraction_x, fraction_y = fraction_px
+        x = pixel[:, None] - fraction_x
+        y = pixel[:, None] - fraction_y
         return np.asarray(self.shares(x[None], y[:, None]) * electrons_per_s, dtype=np.float32)
 
     def spread(
@@ -588,14 +610,12 @@ class SampledPsf(Psf):
         image = np.zeros((height, width))
         columns = np.arange(left, left + width)
         rows = np.arange(top, top + height)
+        half_px = self.footprint_px / 2
         for x, y, light in zip(x_px, y_px, electrons_per_s, strict=True):
-            near_x, near_y = (
-                np.abs(at - middle) < self.footprint_px / 2
-                for at, middle in ((columns, x), (rows, y))
-            )
-            image[np.ix_(near_y, near_x)] += light * self.shares(
-                columns[near_x] - x, rows[near_y, None] - y
-            )
+            near_x = np.abs(columns - x) < half_px
+            near_y = np.abs(rows - y) < half_px
+            shares = self.shares(columns[near_x] - x, rows[near_y, None] - y)
+            image[np.ix_(near_y, near_x)] += light * shares
         return image.astype(np.float32)
 
     def cut_share(self, size_px: int) -> float:
@@ -603,21 +623,20 @@ class SampledPsf(Psf):
         first = len(self._halves) // 2 - size_px
         if first < 0:
             return 0.0
-        insides = []
-        for y in (first, first + 2):
-            for x in (first, first + 2):
-                insides.append(self._halves[y : y + 2 * size_px : 2, x : x + 2 * size_px : 2])
-        return max(0.0, 1 - min(float(part.sum()) for part in insides))
+        end = first + 2 * size_px
+        least = 1.0
+        for y in (0, 2):
+            for x in (0, 2):
+                inside = self._halves[first + y : end + y : 2, first + x : end + x : 2]
+                least = min(least, float(inside.sum()))
+        return 1 - least
 
     def outside_share(self, size_px: int) -> float:
         """The largest of the table beyond half of that side."""
-        far = (
-            np.abs(np.arange(len(self._table)) - len(self._table) // 2) >= size_px * self._steps / 2
-        )
-        return max(
-            float(self._table[far].max(initial=1e-30)),
-            float(self._table[:, far].max(initial=1e-30)),
-        )
+        from_middle = np.abs(np.arange(len(self._table)) - len(self._table) // 2)
+        far = from_middle >= size_px * self._steps / 2
+        largest = max(self._table[far].max(initial=1e-30), self._table[:, far].max(initial=1e-30))
+        return float(largest)
 
     def shader(self, side_px: int) -> ShareShader:
         """The same table: in each cell between four places what its bilinear interpolation is
@@ -692,7 +711,8 @@ def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
         wanted = math.ceil(side_px / (FINE_SIGMAS * max(narrow_px, SHARPEST_PX)))
         parts = min(max(wanted, MIN_PARTS), MAX_PARTS)
         points = (np.arange(parts) + 0.5) / parts - 0.5
-    return points, psf.blurred(side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2))))
+    spread_px = side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2)))
+    return points, psf.blurred(spread_px)
 
 
 def pixel_share(offset_px: float, sigma_px: float) -> float:
@@ -710,9 +730,8 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
 def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
     """As `pixel_share`, of an array of offsets; same shape."""
     if np.size(offset_px) <= BOUND_PLACES:  # as a bench that opens asks for
-        return np.array([pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]).reshape(
-            np.shape(offset_px)
-        )
+        shares = [pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]
+        return np.array(shares).reshape(np.shape(offset_px))
     from scipy.special import erfc  # as in `stamps`
 
     near = np.abs(offset_px) - 0.5
@@ -739,6 +758,7 @@ def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -
 
 
 def _shader_erf(value: Float32Array) -> Float32Array:
+    """The error function by the rational approximation of shaders/shares.glsl."""
     x = np.clip(value, np.float32(-ERF_REACH), np.float32(ERF_REACH))
     square = x * x
     above = np.full_like(x, ERF_ABOVE[0])
@@ -768,12 +788,11 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
         terms = np.polynomial.chebyshev.chebvander(2 * scaled - 1, degree)
         weight = np.maximum(shares / shares[0], 1e-7)
         for _ in range(FIT_ROUNDS):
-            coefficients = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)[0]
+            coefficients, *_ = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)
             error = np.abs(np.exp2(np.minimum(terms @ coefficients, 0.0)) - shares)
             if error.max() <= MAX_SHARE_ERROR:
-                power = np.polynomial.Chebyshev(coefficients, domain=[0.0, reach_px**2]).convert(
-                    kind=np.polynomial.Polynomial
-                )
+                chebyshev = np.polynomial.Chebyshev(coefficients, domain=[0.0, reach_px**2])
+                power = chebyshev.convert(kind=np.polynomial.Polynomial)
                 return tuple(power.coef.tolist())
             # Lawson (1961): towards the smallest maximum
             weight = weight * np.sqrt(error / error.max() + 1e-3)

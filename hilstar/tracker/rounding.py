@@ -53,7 +53,8 @@ def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
     total = np.zeros(np.broadcast_shapes(level_dn.shape, noise_dn.shape))
     for order in HARMONICS:
         damped = np.exp(-2 * (math.pi * order * noise_dn) ** 2)
-        total += (-1) ** order / (math.pi * order) * np.sin(2 * math.pi * order * level_dn) * damped
+        amplitude = (-1) ** order / (math.pi * order)
+        total += amplitude * np.sin(2 * math.pi * order * level_dn) * damped
     return total
 
 
@@ -74,7 +75,8 @@ def rounded_light(light_dn: FloatArray, dark_noise_dn: float, dn_per_e: float) -
         return np.zeros(STEP_PHASES)
     noise_dn = np.sqrt(dark_noise_dn**2 + dn_per_e * light_dn)
     lit = rounding_error(PLACES_DN + light_dn, noise_dn)
-    return np.asarray((lit - rounding_error(PLACES_DN, np.array(dark_noise_dn))).mean(axis=1))
+    dark = rounding_error(PLACES_DN, np.array(dark_noise_dn))
+    return np.asarray((lit - dark).mean(axis=1))
 
 
 def cut_mean_dn(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
@@ -111,5 +113,7 @@ def cut_light(light_dn: FloatArray, dark_mean_dn: float, noise_dn: float, dn_per
         return 0.0
     dark_dn = uncut_level_dn(dark_mean_dn, noise_dn)
     spread_dn = np.sqrt(noise_dn**2 + dn_per_e * light_dn)
-    lit_dn = cut_mean_dn(dark_dn + light_dn, spread_dn) - (dark_dn + light_dn)
-    return float((lit_dn - (dark_mean_dn - dark_dn)).mean())
+    level_dn = dark_dn + light_dn
+    added_to_light_dn = cut_mean_dn(level_dn, spread_dn) - level_dn
+    added_to_dark_dn = dark_mean_dn - dark_dn
+    return float((added_to_light_dn - added_to_dark_dn).mean())

@@ -243,9 +243,9 @@ class _LensRays:
                 "it has no focal length or no wavelength; write a lens that forms an image"
             )
         frame = optic.image_surface.geometry.cs
-        self._image_mm, self._to_image = (
-            np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform()
-        )
+        image_mm, to_image = frame.get_effective_transform()
+        self._image_mm = np.asarray(image_mm, dtype=np.float64)
+        self._to_image = np.asarray(to_image, dtype=np.float64)
         self.centre_mm = np.zeros(2)
         self.sign = 1.0
         edge = np.array([[0.0, 0.0], [0.0, EDGE]])
@@ -257,7 +257,8 @@ class _LensRays:
             )
         # A lens with one field, on the axis, has no direction in which its image could be turned
         # round.
-        self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0]))) or 1.0
+        outward = (tangents[1] - tangents[0]) @ (places[1] - places[0])
+        self.sign = float(np.sign(outward)) or 1.0
         self.centre_mm = places[0]
 
     def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
@@ -274,12 +275,12 @@ class _LensRays:
         """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields
         (n, 2) relative to the largest.
         """
-        none = np.zeros(len(fields))
-        starts = self.optic.ray_tracer.ray_generator.generate_rays(
-            fields[:, 0], fields[:, 1], none, none, um
-        )
+        x, y = fields.T
+        pupil_middle = np.zeros(len(fields))
+        generate = self.optic.ray_tracer.ray_generator.generate_rays
+        starts = generate(x, y, pupil_middle, pupil_middle, um)
         tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
-        rays = self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um)
+        rays = self.optic.trace_generic(x, y, pupil_middle, pupil_middle, um)
         places, _ = self.at_image(rays)
         return tangents, places.T
 
@@ -289,7 +290,8 @@ class _LensRays:
         """
         if self.max_field == 0:
             return np.zeros_like(places_mm)
-        tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
+        near_axis = np.array([[0.0, 0.0], [0.0, EDGE]])
+        tangents, _ = self.chiefs(near_axis, self.primary_um)
         slope_mm = camera.focal_length_mm * float(tangents[1, 1] - tangents[0, 1]) / EDGE
         fields = places_mm / slope_mm
         for _ in range(CHIEF_ROUNDS):
@@ -299,42 +301,47 @@ class _LensRays:
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
+        """Rays of a pupil's grid (n, n) from a field (2,), relative to the largest, at a
+        wavelength.
+        """
         at = (np.arange(rays) + 0.5) / rays * 2 - 1
         across, down = np.meshgrid(at, at)
         filled = _filled(rays)
         radius = float(np.hypot(*field))
-        at_field = radius * self.max_field
-        beside_cut, along_cut, shift = (
-            np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:]
-        )
+        radii, *factors = self._vignetting
+        at_radius = radius * self.max_field
+        beside_cut, along_cut, shift = (np.interp(at_radius, radii, part) for part in factors)
         # the field's direction is the factors' y
-        turn = field / radius if radius else np.array([0.0, 1.0])
-        along = across * turn[0] + down * turn[1]
-        beside = across * turn[1] - down * turn[0]
+        turn_x, turn_y = field / radius if radius else np.array([0.0, 1.0])
+        along = across * turn_x + down * turn_y
+        beside = across * turn_y - down * turn_x
         moved_along = shift - along_cut * along
         moved_beside = beside_cut * beside
         # beyond it only where no light is
-        px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)
-        py = np.clip(down + moved_along * turn[1] + moved_beside * turn[0], -1, 1)
+        px = np.clip(across + moved_along * turn_x - moved_beside * turn_y, -1, 1)
+        py = np.clip(down + moved_along * turn_y + moved_beside * turn_x, -1, 1)
         hx = np.full(px.size, field[0])
         hy = np.full(px.size, field[1])
+
+        def on_grid(values: Any) -> FloatArray:
+            return np.array(values).reshape(px.shape)
+
         generate = self.optic.ray_tracer.ray_generator.generate_rays
-        first = generate(hx, hy, px.ravel(), py.ravel(), um)
-        x0, y0, z0, l0, m0, n0 = (
-            np.array(getattr(first, name)).reshape(px.shape)
-            for name in ("x", "y", "z", "L", "M", "N")
-        )
-        found = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
-        (x, y), cosines = (np.array(part).reshape(-1, *px.shape) for part in self.at_image(found))
-        path, light = (np.array(getattr(found, name)).reshape(px.shape) for name in ("opd", "i"))
+        start = generate(hx, hy, px.ravel(), py.ravel(), um)
+        x0, y0, z0 = on_grid(start.x), on_grid(start.y), on_grid(start.z)
+        l0, m0, n0 = on_grid(start.L), on_grid(start.M), on_grid(start.N)
+        end = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
+        places, cosines = self.at_image(end)
+        x, y = on_grid(places[0]), on_grid(places[1])
+        path, light = on_grid(end.opd), on_grid(end.i)
         good = (filled > 0) & np.isfinite(x + y + path) & (light > 0)
         # A plane wave's path up to where its rays start, and the area of the beam that each ray
         # stands for.
         path = path + l0 * x0 + m0 * y0 + n0 * z0
         area = np.abs(_determinant(x0, y0)) * np.abs(n0)
-        return _Bundle(
-            x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0)
-        )
+        weighted = np.nan_to_num(light) * area * filled
+        cosines = np.array(cosines).reshape(3, *px.shape)
+        return _Bundle(x, y, cosines, path, np.where(good, weighted, 0.0))
 
 
 def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
@@ -369,63 +376,68 @@ def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
 def _filled(rays: int) -> FloatArray:
     """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
     fine = (np.arange(rays * FINER) + 0.5) / (rays * FINER) * 2 - 1
-    return np.asarray(
-        (fine**2 + fine[:, None] ** 2 <= 1).reshape(rays, FINER, rays, FINER).mean(axis=(1, 3))
-    )
+    inside = fine**2 + fine[:, None] ** 2 <= 1
+    cells = inside.reshape(rays, FINER, rays, FINER)
+    return np.asarray(cells.mean(axis=(1, 3)))
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
     """The determinant of the map from a grid's cells to (a, b): the area of each cell there."""
-    (a_down, a_right), (b_down, b_right) = np.gradient(a), np.gradient(b)
+    a_down, a_right = np.gradient(a)
+    b_down, b_right = np.gradient(b)
     return np.asarray(a_right * b_down - a_down * b_right)
 
 
 def _glass(
     lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, made_by: str
 ) -> Traced:
-    pitch_mm, (width, height) = plate.pitch_um * 1e-3, plate.resolution_px
-    middle = (np.array([width, height]) - 1) / 2
+    """The glass of rays' PSFs, at each place of a grid over the plate, wavelength and focus."""
+    pitch_mm = plate.pitch_um * 1e-3
+    middle = (np.array(plate.resolution_px) - 1) / 2
     camera = _Chiefs.of(lens)
     places = _field_points(lens, plate)
     fields = lens.fields_at(places * pitch_mm, camera)
-    finest_um = lens.wavelengths_um[0] * lens.f_number / 2
-    samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(plate.pitch_um / finest_um)))
-    grid = 2 * plate.half_px * samples + 1, pitch_mm / samples
+    samples = per_px or _samples_a_px(lens, plate)
+    side = 2 * plate.half_px * samples + 1
+    grid = side, pitch_mm / samples
     images = []
     at = []
     facts = []
-    axis_light: dict[float, float] = {}
     for um in lens.wavelengths_um:
-        axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
-        if axis_light[um] <= 0:
+        axis_light = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
+        if axis_light <= 0:
             raise InputError(
                 "no ray of its field's middle reaches the image; do apertures lie beside the beam?"
             )
-        for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
+        _, chiefs_mm = lens.chiefs(fields, um)
+        for place, field, chief_mm in zip(places, fields, chiefs_mm, strict=True):
             slopes = _slopes(lens, field, um)
-            light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]
+            light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light
             for focus_um in sorted(set(plate.focuses_um)):
+                focused_mm = chief_mm + slopes * focus_um * 1e-3
                 if light > MIN_LIT:
-                    image, outside = _psf(
-                        lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid
-                    )
+                    ray_of_light = field, um, focus_um * 1e-3
+                    image, outside = _psf(lens, ray_of_light, focused_mm, grid)
+                    illumination = min(light, 2.0)
                 else:
-                    image = _dark(grid[0])
-                    outside = 0.0
+                    image, outside = _dark(side), 0.0
+                    illumination = 0.0
+                moved = focused_mm / pitch_mm - place
                 images.append(image)
                 at.append((*(middle + place), um * 1e3, focus_um))
-                moved = (chief + slopes * focus_um * 1e-3) / pitch_mm - place
-                facts.append((min(light, 2.0) if light > MIN_LIT else 0.0, outside, *moved))
+                facts.append((illumination, outside, *moved))
     stack = Stack(np.array(images), np.array(at), np.array(facts), samples)
-    history = (
-        made_by,
-        f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}",
-    )
-    return Traced(
-        glass_of(stack, tolerance, camera.lens, history=history),
-        camera.focal_length_mm,
-        lens.f_number,
-    )
+    focal_mm = camera.focal_length_mm
+    history = (made_by, f"focal length {focal_mm:.6g} mm, F-number {lens.f_number:.4g}")
+    glass = glass_of(stack, tolerance, camera.lens, history=history)
+    return Traced(glass, focal_mm, lens.f_number)
+
+
+def _samples_a_px(lens: _LensRays, plate: Plate) -> int:
+    """Samples to a pixel, two to the finest detail of the shortest wave."""
+    finest_um = lens.wavelengths_um[0] * lens.f_number / 2
+    wanted = math.ceil(plate.pitch_um / finest_um)
+    return min(MAX_SAMPLES, max(MIN_SAMPLES, wanted))
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
@@ -435,23 +447,27 @@ def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
     half = (np.array(plate.resolution_px) - 1) / 2
     if lens.max_field == 0:
         return np.zeros((1, 2))
-    edge_px = float(np.linalg.norm(lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)[1])) / (
-        plate.pitch_um * 1e-3
-    )
+    _, edge_mm = lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)
+    edge_px = float(np.linalg.norm(edge_mm)) / (plate.pitch_um * 1e-3)
     scale = min(1.0, edge_px / float(np.hypot(*half)))
-    columns, rows = (np.unique(np.linspace(-size * scale, size * scale, POINTS)) for size in half)
-    return np.stack([part.ravel() for part in np.meshgrid(columns, rows)], axis=1)
+    half_x, half_y = half * scale
+    columns = np.unique(np.linspace(-half_x, half_x, POINTS))
+    rows = np.unique(np.linspace(-half_y, half_y, POINTS))
+    x, y = np.meshgrid(columns, rows)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _slopes(lens: _LensRays, field: FloatArray, um: float) -> FloatArray:
-    rays = lens.optic.trace_generic(
-        np.array([field[0]]), np.array([field[1]]), np.zeros(1), np.zeros(1), um
-    )
-    cosines = lens.at_image(rays)[1][:, 0]
-    return np.asarray(cosines[:2] / cosines[2])
+    """How far (2,) a field's chief ray moves right and down for a step away from the lens."""
+    x, y = field[:1], field[1:]
+    rays = lens.optic.trace_generic(x, y, np.zeros(1), np.zeros(1), um)
+    _, cosines = lens.at_image(rays)
+    across, down, along = cosines[:, 0]
+    return np.array([across / along, down / along])
 
 
 def _dark(side: int) -> FloatArray:
+    """What stands for the PSF of a place without light: all light in its middle sample."""
     image = np.zeros((side, side))
     image[side // 2, side // 2] = 1.0
     return image
@@ -468,40 +484,46 @@ def _psf(
 
     `light` is its field, wavelength (um) and defocus (mm), `grid` the stamp's side and step (mm).
     """
-    (field, um, defocus_mm), (side, step_mm) = light, grid
+    field, um, defocus_mm = light
+    side, step_mm = grid
     needed = math.ceil(PERIOD_MARGIN * side * step_mm / (um * 1e-3 * lens.f_number))
     if needed > MAX_RAYS:
-        return _counted(lens.bundle(field, um, GEOMETRIC_RAYS), defocus_mm, centre, side, step_mm)
-    return _waves(
-        lens.bundle(field, um, max(MIN_RAYS, needed)), um, defocus_mm, centre, (side, step_mm)
-    )
+        rays = lens.bundle(field, um, GEOMETRIC_RAYS)
+        return _counted(rays, defocus_mm, centre, side, step_mm)
+    rays = lens.bundle(field, um, max(MIN_RAYS, needed))
+    return _waves(rays, um, defocus_mm, centre, grid)
 
 
 def _waves(
     rays: _Bundle, um: float, defocus_mm: float, centre: FloatArray, grid: tuple[int, float]
 ) -> tuple[FloatArray, float]:
+    """The PSF of the waves that rays stand for: their sum's square on the stamp's samples, by
+    finer ones where these are wider than half a fringe.
+    """
     side, step_mm = grid
-    finer = max(1, math.ceil(step_mm / (um * 1e-3 * 0.5 * _fastest(rays))) // 2 * 2 + 1)
+    fringe_mm = um * 1e-3 * 0.5 * _fastest(rays)
+    finer = max(1, math.ceil(step_mm / fringe_mm) // 2 * 2 + 1)
     at_mm = (np.arange(side * finer) - (side * finer) // 2) * step_mm / finer
     wave = 2 * np.pi / (um * 1e-3)
     cos_x, cos_y, cos_z = rays.cosines
     # Solid angle times its cosine; of a cell at the pupil's edge both light and angle are a part.
     angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y))) * _filled(len(rays.x))
     lit = rays.light > 0
-    path = (
-        rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
-    )
+    moved_x = rays.x - centre[0]
+    moved_y = rays.y - centre[1]
+    path = rays.path + cos_z * defocus_mm - cos_x * moved_x - cos_y * moved_y
     path = path[lit] - np.median(path[lit])
     light = rays.light[lit]
     angle = angle[lit]
     cos_x = cos_x[lit]
     cos_y = cos_y[lit]
-    part = np.sqrt(light * angle) * np.exp(1j * wave * path)
+    amplitude = np.sqrt(light * angle) * np.exp(1j * wave * path)
     # a phase that no light shows
-    middle_x, middle_y = (np.average(cosine, weights=light) for cosine in (cos_x, cos_y))
+    middle_x = np.average(cos_x, weights=light)
+    middle_y = np.average(cos_y, weights=light)
     across = np.exp(1j * wave * np.outer(cos_x - middle_x, at_mm))
     down = np.exp(1j * wave * np.outer(cos_y - middle_y, at_mm))
-    image = np.abs((down * part[:, None]).T @ across) ** 2
+    image = np.abs((down * amplitude[:, None]).T @ across) ** 2
     # Parseval: the integral over the image is the wavelength squared times that of the squared
     # amplitude over solid angles.
     total = float(light.sum()) * (um * 1e-3 / (step_mm / finer)) ** 2
@@ -510,8 +532,11 @@ def _waves(
 
 
 def _fastest(rays: _Bundle) -> float:
+    """The F-number of the fastest beam, across or down, that has light."""
     lit = rays.light > 0
-    return 1 / max(1e-6, float(max(np.ptp(cosine[lit]) for cosine in rays.cosines[:2])))
+    cos_x, cos_y, _ = rays.cosines
+    widest = float(max(np.ptp(cos_x[lit]), np.ptp(cos_y[lit])))
+    return 1 / max(1e-6, widest)
 
 
 def _counted(
@@ -519,22 +544,23 @@ def _counted(
 ) -> tuple[FloatArray, float]:
     """Rays shared out among the four samples nearest to each."""
     lit = rays.light > 0
-    light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
+    light = rays.light[lit]
+    cos_x, cos_y, cos_z = rays.cosines[:, lit]
     x_mm = rays.x[lit] + cos_x / cos_z * defocus_mm - centre[0]
     y_mm = rays.y[lit] + cos_y / cos_z * defocus_mm - centre[1]
-    x, y = x_mm / step_mm + side // 2, y_mm / step_mm + side // 2
-    column = np.floor(x).astype(np.intp)
-    row = np.floor(y).astype(np.intp)
+    x = x_mm / step_mm + side // 2
+    y = y_mm / step_mm + side // 2
+    first_column = np.floor(x).astype(np.intp)
+    first_row = np.floor(y).astype(np.intp)
     image = np.zeros((side, side))
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        share = light * np.abs(1 - down - (y - row)) * np.abs(1 - right - (x - column))
-        inside = (
-            (column + right >= 0)
-            & (column + right < side)
-            & (row + down >= 0)
-            & (row + down < side)
-        )
-        np.add.at(image, (row[inside] + down, column[inside] + right), share[inside])
+        share_y = np.abs(1 - down - (y - first_row))
+        share_x = np.abs(1 - right - (x - first_column))
+        share = light * share_y * share_x
+        column = first_column + right
+        row = first_row + down
+        inside = (column >= 0) & (column < side) & (row >= 0) & (row < side)
+        np.add.at(image, (row[inside], column[inside]), share[inside])
     return image, float(np.clip(1 - image.sum() / light.sum(), 0, 0.999))
 
 
@@ -550,35 +576,35 @@ class _Chiefs:
     def places_mm(self, tangents: FloatArray) -> FloatArray:
         """Where it has directions (n, 2)."""
         if self.lens is None:
-            bent = tangents
-        else:
-            bent = np.stack(self.lens.bent(*tangents.T), axis=1)
-        return np.asarray(self.focal_length_mm * bent)
+            return np.asarray(self.focal_length_mm * tangents)
+        u, v = self.lens.bent(*tangents.T)
+        return np.asarray(self.focal_length_mm * np.stack([u, v], axis=1))
 
     @classmethod
     def of(cls, lens: _LensRays) -> "_Chiefs":
+        """By least squares of places on the field's spokes."""
         if lens.max_field == 0:
             return cls(lens.focal_length_mm, None)
         turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)
         radius = np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]
-        fields = (radius[:, None, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)).reshape(
-            -1, 2
-        )
+        spokes = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+        fields = (radius[:, None, None] * spokes).reshape(-1, 2)
         tangents, places = lens.chiefs(fields, lens.primary_um)
         known = np.isfinite(places).all(axis=1)
         largest = float(np.hypot(*tangents.T).max())
-        (u, v), places = tangents[known].T / largest, places[known] / largest
+        u, v = tangents[known].T / largest
+        places = places[known] / largest
         r2 = u * u + v * v
         # A column of equations for each coefficient: all places' x, then all places' y.
         radial = [np.concatenate([u * r2**power, v * r2**power]) for power in range(4)]
         p1_column = np.concatenate([2 * u * v, r2 + 2 * v * v])
         p2_column = np.concatenate([r2 + 2 * u * u, 2 * u * v])
         columns = np.stack([*radial, p1_column, p2_column], axis=1)
-        coefficients = np.linalg.lstsq(columns, places.T.ravel(), rcond=None)[0].tolist()
+        solution, *_ = np.linalg.lstsq(columns, places.T.ravel(), rcond=None)
+        focal, *distortion = solution.tolist()
         # of tangents relative to the largest: turned back to tangents
-        focal, *distortion = coefficients
-        k1, k2, k3, p1, p2 = (
-            part / focal / largest**power
-            for part, power in zip(distortion, (2, 4, 6, 1, 1), strict=True)
-        )
+        coefficients = []
+        for relative, power in zip(distortion, (2, 4, 6, 1, 1), strict=True):
+            coefficients.append(relative / focal / largest**power)
+        k1, k2, k3, p1, p2 = coefficients
         return cls(focal, Lens((k1, k2, k3), (p1, p2)))

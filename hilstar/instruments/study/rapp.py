@@ -16,6 +16,7 @@ from hilstar.basics.charts import MUTED, SERIES, chart, label_ends, plain_ticks,
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S
+from hilstar.instruments.study.engine import ChartFinding, write_findings
 from hilstar.instruments.study.fields import Field, fields_of
 from hilstar.instruments.study.study_benches import study_optics
 from hilstar.optics.camera import Camera
@@ -57,14 +58,6 @@ BENCH_FILES = (
     "findings.csv",
 )
 STAR_COLUMNS = ("field", "hip", "v_mag", "bv_mag", "temperature_k", "rapp3")
-
-
-@dataclass(frozen=True, slots=True)
-class ChartFinding:
-    """A chart, by the stem of its files, and what it says."""
-
-    figure: str
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +159,7 @@ def bench_rapp(
     findings += [
         ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}") for field in fields
     ]
-    table = [(finding.figure, finding.text) for finding in findings]
-    write_csv(directory / "findings.csv", ("figure", "finding"), table)
+    write_findings(directory, findings)
     return findings
 
 

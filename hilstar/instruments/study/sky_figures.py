@@ -19,9 +19,14 @@ from hilstar.basics.charts import (
 )
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S, flux_ratio
+from hilstar.instruments.study.engine import (
+    ChartFinding,
+    CurvePanel,
+    PanelSpec,
+    draw_curves,
+    write_columns,
+)
 from hilstar.instruments.study.fields import FIELDS
-from hilstar.instruments.study.rapp import ChartFinding
-from hilstar.instruments.study.row_charts import CurvePanel, PanelSpec, draw_curves, write_columns
 from hilstar.sky.air import NIGHT_SKY
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import REFERENCE_TEMPERATURE_K, SUN_TEMPERATURE_K, load_library

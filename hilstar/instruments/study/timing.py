@@ -22,7 +22,7 @@ import numpy as np
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import plain_ticks, write_records
+from hilstar.basics.charts import plain_ticks
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
@@ -35,15 +35,16 @@ from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.shutter import S_PER_US
 from hilstar.instruments.study import study_benches
-from hilstar.instruments.study.predictors import Movement, attitude_at
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
     ChartSpec,
     LineSpec,
     PanelSpec,
     draw_rows,
     looks_of,
     row_panels,
+    write_rows,
 )
+from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.exposure_motion import Motion, smeared_sprites
 from hilstar.optics.layers.view import STILL, View
@@ -190,7 +191,7 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
 def stripe_findings(directory: Path) -> list[str]:
     """Write `stripes.csv` and its chart; its finding. Raises InputError."""
     points = [point for case in STRIPE_CASES for point in stripe_points(case)]
-    write_records(directory / "stripes.csv", points)
+    write_rows(directory / "stripes.csv", points)
     return [draw_stripes(directory / "stripes", points)]
 
 
@@ -490,7 +491,7 @@ def _exposure_points(
 
 def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
     """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
-    write_records(directory / "beat.csv", points)
+    write_rows(directory / "beat.csv", points)
     cases: dict[TimingCase, list[BeatPoint]] = {}
     for point in points:
         cases.setdefault(TimingCase(point.refreshes, point.lit), []).append(point)
@@ -634,7 +635,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
     others = OtherWork()
     outcomes = measure(quick)
     load = others.load()
-    write_records(directory / "timing.csv", outcomes)
+    write_rows(directory / "timing.csv", outcomes)
     finding = draw(directory / "timing", outcomes, load)
     lines = []
     for o in outcomes:

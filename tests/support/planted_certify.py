@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import datetime
 from collections import defaultdict
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from tests.support.planted_readings import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
 
     from hilstar.server.bench.certificate_file import Certificate
 
@@ -201,14 +202,28 @@ def stated_directions() -> str:
     return f"[certify.tracker]\nname = 'planted'\n{expanded}\n"
 
 
+# What a part of a certificate is read by; the figures that it tells.
+LIGHT, PLACE, DELAY = "light", "place", "delay"
+PARTS = {
+    LIGHT: QUANTITIES[:1],
+    PLACE: QUANTITIES[1:6],
+    DELAY: QUANTITIES[6:],
+}
+
+
 def coverage(
     draw: Callable[[np.random.Generator], Truth],
     benches: int,
     seed: int,
     keys: str = "",
     tables: str = EXACT_LENS,
+    parts: tuple[str, ...] = (LIGHT, PLACE, DELAY),
 ) -> dict[tuple[str, str], Counted]:
-    """Certify planted benches of a kind by their readings and count, by quantity and region."""
+    """Certify planted benches of a kind by their readings and count, by quantity and region.
+
+    Of `parts` alone each bench's fits are made and its figures are counted: the others are the
+    first bench's, which no figure of `parts` goes by.
+    """
     found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         path = Path(folder) / "bench.toml"
@@ -217,17 +232,39 @@ def coverage(
         )
         path.write_text(f"{bench}[certify]\nfields = 1\n{keys}{tables}")
         file = read_bench_file(path)
-        # Every bench file is the same, so that its stars are; one batch of trials knows an end
-        # within 2 % of the half width.
-        stars = assembly.reference_stars(file)
-        patch.setattr(assembly, "reference_stars", lambda file: stars)
+        # Every bench file is the same, so that its stars are, and what the sky adds to them; one
+        # batch of trials knows an end within 2 % of the half width.
+        for name in ("reference_stars", "of_sky"):
+            patch.setattr(assembly, name, _once(getattr(assembly, name)))
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
+        # A certificate takes its first check, which is in no figure of it.
+        patch.setattr(certificate, "take_check", lambda file, reader: None)
+        if LIGHT not in parts:
+            patch.setattr(assembly, "light_deviation", _once(assembly.light_deviation))
+            patch.setattr(assembly, "evenness", _once(assembly.evenness))
+        if PLACE not in parts:
+            patch.setattr(assembly, "lens_fit", _once(assembly.lens_fit))
+        stars = assembly.reference_stars(file)
+        counted = [quantity for part in parts for quantity in PARTS[part]]
         for number in range(benches):
             rng = np.random.default_rng((seed, number))
             one = draw(rng)
             certified, _ = certificate.certify(file, PlantedReader(one, rng), NOW, quick=True)
-            count(certified, true_figures(one, stars), found)
+            count(certified, true_figures(one, stars), found, counted)
     return dict(found)
+
+
+def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that gives its first result again, whatever it is asked."""
+    results: list[Any] = []
+
+    def first(*arguments: object) -> object:
+        if not results:
+            result = function(*arguments)
+            results.append(result if not isinstance(result, Iterator) else list(result))
+        return results[0]
+
+    return first
 
 
 DETECTOR = "[tracker.detector]\nread_noise_e = 15\n"
@@ -267,16 +304,18 @@ def count(
     certified: Certificate,
     truth: dict[tuple[str, int | None], float],
     found: dict[tuple[str, str], Counted],
+    quantities: Collection[str] = QUANTITIES,
 ) -> None:
-    """Add one certificate to the counts."""
-    stated = [each for each in certified.figures if each.quantity in QUANTITIES]
+    """Add one certificate's figures of some quantities to the counts."""
+    stated = [each for each in certified.figures if each.quantity in quantities]
     for each in stated:
         region = "field" if each.region.startswith("field") else each.region
         one, true = found[each.quantity, region], truth[each.quantity, each.star]
         one.held.append(each.lower <= true <= each.upper)
         one.error.append(each.value - true)
         one.standard.append(each.standard_uncertainty)
-    for quantity in {name for name, _ in truth} - {each.quantity for each in stated}:
+    of_truth = {name for name, _ in truth} & set(quantities)
+    for quantity in of_truth - {each.quantity for each in stated}:
         for region in (
             REGIONS
             if quantity in QUANTITIES[:3]

@@ -22,7 +22,12 @@ from hilstar.display.response import Response
 from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.first_light.context import StepContext
 from hilstar.instruments.calibrate.first_light.focus import seen_sharpness
-from hilstar.instruments.calibrate.first_light.photometer import Assumed, Photometer, Readings
+from hilstar.instruments.calibrate.first_light.photometer import (
+    Assumed,
+    LatticeRatio,
+    Photometer,
+    Readings,
+)
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.instruments.calibrate.geometric.geometry_fit import dot_sigma_px, psf_sigma_of
 from hilstar.instruments.calibrate.latency import pair, swap_to_square_ms
@@ -40,11 +45,27 @@ EDGE_TRACKER_PX = 8.0
 MAX_DOTS = 4000
 MIN_DOTS = 60
 PAIRS = 4  # of images, for each ratio of two lattices
+BESIDE_PAIRS = 16  # of simulated readings: a third of a reading's noise, as what white has in all
 DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could saturate the tracker
 WATCHED_S = 5.0
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
 NO_LIGHT_DN_PER_S = 1e-9
 STEP_PX = 10.0  # of the screen, by which the mounting of a truth is compared
+
+
+@dataclass(frozen=True, slots=True)
+class BesideRatio:
+    """Light of a pixel among lit ones of its code, relative to that of one alone: 1 where pixels
+    leave each other's light as it is. `error` is one standard error.
+    """
+
+    ratio: float
+    error: float
+
+    @property
+    def excess(self) -> float:
+        """How far the ratio is from 1 beyond its noise, one sigma."""
+        return math.sqrt(max((self.ratio - 1) ** 2 - self.error**2, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +75,8 @@ class LightReadings:
 
     It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings
     have in common, as the ratios of lattices, is in `common` (n, inputs), one sigma relative to
-    light. `noise` (n,) is each
-    reading's noise, e-/s, up to a factor that their scatter tells; None where it goes with light.
+    light. `noise` (n,) is each reading's noise, e-/s, up to a factor that their scatter tells; None
+    where it goes with light. `beside` is None where no neighbouring pixels were read.
     """
 
     code: IntArray
@@ -64,6 +85,7 @@ class LightReadings:
     square_px: tuple[int, int, int] | None = None
     common: FloatArray | None = None
     noise: FloatArray | None = None
+    beside: BesideRatio | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +172,7 @@ class VirtualReader:
         self.file = file
         self.truth = truth
         self._rng = np.random.default_rng((seed, 0xCE27, turn))
+        self._beside_rng = np.random.default_rng((seed, 0xBE51, turn))
         self.identity = f"virtual: {truth.path.name}, sha256 {truth.sha256}, seed {seed}"
         self._noise = truth.config.certify.virtual
         self._t_s = 0.0
@@ -184,7 +207,12 @@ class VirtualReader:
         scale = self._white_e_per_s * here * (1 + noise.instrument_error) * (warmth - cold)
         wanted = (self._response.light[codes] + self._response.black) * scale
         read: FloatArray = wanted * (1 + noise.reading_noise * rng.standard_normal(len(codes)))
-        return LightReadings(codes, read, t_s)
+        return LightReadings(codes, read, t_s, beside=self._beside())
+
+    def _beside(self) -> BesideRatio:
+        """A truth file's pixels leave each other's light as it is; the mean of pairs has noise."""
+        error = self._noise.reading_noise * math.sqrt(2 / BESIDE_PAIRS)
+        return BesideRatio(1 + error * float(self._beside_rng.standard_normal()), error)
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """The dots' places by the truth's lens, with noise."""
@@ -317,6 +345,7 @@ class ImageReader:
             square_px=(meter.field.left, meter.field.top, meter.field.side),
             common=_common(readings),
             noise=readings.sigma * gain,
+            beside=_beside(readings.links),
         )
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
@@ -377,6 +406,17 @@ class ImageReader:
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
         return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
+
+
+def _beside(links: list[LatticeRatio]) -> BesideRatio | None:
+    """The densest lattice against the sparsest, by the ratios between them; None where no lattice
+    has neighbours lit.
+    """
+    if not links or links[0].dense > 1:
+        return None
+    ratio = math.prod(link.ratio for link in links)
+    relative = [link.error / link.ratio for link in links]
+    return BesideRatio(ratio, ratio * math.hypot(*relative))
 
 
 def _common(readings: Readings) -> FloatArray:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.instruments.confront.background import NO_PATTERN, fixed_pattern, sky_level
+from hilstar.instruments.confront.background import FixedPattern, fixed_pattern, sky_level
 from hilstar.instruments.confront.photon_transfer import (
     _median_error,
     fit_pixels,
@@ -40,7 +40,7 @@ def fitted(images, bench=BENCH):
     pattern = fixed_pattern(
         (dn - level, level, ~EVERY) for dn, level in zip(images, levels, strict=True)
     )
-    return fit_pixels(np.concatenate(points), 1.0, None, bench, pattern or NO_PATTERN)
+    return fit_pixels(np.concatenate(points), 1.0, None, bench, pattern or FixedPattern())
 
 
 @pytest.mark.parametrize("ramp_e", [0.0, 12_000.0])
@@ -105,7 +105,7 @@ def test_read_noise_is_what_variance_is_left_of_no_light_but_for_the_codes_own(r
     true_dn2 = level_dn / gain + (read_e / gain) ** 2 + 1 / 12
     points = np.column_stack([level_dn, true_dn2 * rng.normal(1.0, 1e-4, len(level_dn))])
     bench = DetectorSettings(gain_e_per_dn=gain, read_noise_e=10.0)
-    pixels = fit_pixels(points, 1.0, None, bench, NO_PATTERN)
+    pixels = fit_pixels(points, 1.0, None, bench, FixedPattern())
     assert pixels.gain_told
     assert pixels.gain_e_per_dn == pytest.approx(gain, rel=1e-3)
     assert pixels.read_noise_e == pytest.approx(read_e, rel=0.01)

@@ -117,7 +117,7 @@ class Errors:
         return float(2 * np.mean(self.error_px * np.sin(2 * np.pi * self.phase_px)))
 
 
-def measure(sigma_px: float, snr: float, settings: CentroidSettings, seed: int) -> Errors:
+def centroid_errors(sigma_px: float, snr: float, settings: CentroidSettings, seed: int) -> Errors:
     """Errors, x and y together, of the centroids of STARS stars with photon and read noise."""
     rng = np.random.default_rng(seed)
     field = star_field(sigma_px, flux_for(snr, sigma_px), rng, 2 * settings.radius_px + 5)
@@ -235,7 +235,7 @@ def test_an_elliptical_stars_axes_have_an_s_curve_each():
 @pytest.mark.parametrize("sigma_px", SIGMAS_PX)
 def test_the_scatter_is_the_pixels_noise_propagated(sigma_px, snr):
     settings = replace(window_for(sigma_px), psf_sigma_px=(sigma_px, sigma_px))
-    errors = measure(sigma_px, snr, settings, seed=11)
+    errors = centroid_errors(sigma_px, snr, settings, seed=11)
     assert errors.found == 1.0
     assert errors.scatter_px == pytest.approx(
         predicted_scatter_px(sigma_px, snr, settings), rel=SCATTER_TOLERANCE
@@ -433,7 +433,7 @@ if __name__ == "__main__":
                 f" {np.abs(bias_px(sigma, known)).max():.1e} "
             ]
             for signal_to_noise in (10.0, *FIRST_ORDER_SNR):
-                got = measure(sigma, signal_to_noise, known, seed=11)
+                got = centroid_errors(sigma, signal_to_noise, known, seed=11)
                 cells.append(f"{got.scatter_px:.4f} ({100 * got.found:5.1f} %)")
             if window == "gaussian":
                 cells += [

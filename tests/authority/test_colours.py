@@ -55,7 +55,7 @@ def saved(path, values):
     return np.interp(GRID_NM, SENSOR_NM, values.round(9), left=0, right=0)
 
 
-def bench(folder, panel, sensor, **render):
+def panel_bench(folder, panel, sensor, **render):
     """A bench of a panel and a sensor, and the sensor's curves (channels, n) on the grid."""
     written(folder / "panel.csv", PANELS[panel])
     names = (
@@ -125,7 +125,7 @@ def drives(frame, opened):
 @pytest.mark.parametrize("panel", PANELS)
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, sensor):
-    opened, curves = bench(tmp_path, panel, SENSORS[sensor])
+    opened, curves = panel_bench(tmp_path, panel, SENSORS[sensor])
     with opened:
         matrix, _ = photons_of_panel(panel, curves)
         matrix /= matrix.sum()
@@ -173,7 +173,7 @@ def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, 
 @pytest.mark.parametrize("panel", PANELS)
 @pytest.mark.parametrize("sensor", MONO)
 def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, panel, sensor):
-    opened, curves = bench(tmp_path, panel, MONO[sensor])
+    opened, curves = panel_bench(tmp_path, panel, MONO[sensor])
     with opened:
         stars = opened.stars
         _, of_primaries = photons_of_panel(panel, curves)
@@ -213,7 +213,7 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
         glass_of(Stack(np.array([dot] * len(places)), np.array(places), np.array(lateral), 2)),
     )
     sensor = np.where((SENSOR_NM > 420) & (SENSOR_NM < 700), MONO["visible"], 0.0)
-    without, curves = bench(tmp_path, "lcd", sensor)
+    without, curves = panel_bench(tmp_path, "lcd", sensor)
     path = tmp_path / "bench.toml"
     path.write_text(path.read_text() + '\n[tracker.optics]\npsf = "glass.fits"\n')
     with without, load(path) as opened:

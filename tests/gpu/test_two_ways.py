@@ -34,7 +34,7 @@ USUAL = (0.85, 0.85)
 SRGB8 = srgb_response(8)
 
 
-def stars(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
+def stars_or_paths(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
     """Stars all over the image and its edges, many faint ones and few that clip, or paths of
     `per_star` sprites.
     """
@@ -49,7 +49,7 @@ def stars(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
     return replace(packed, per_star=per_star)
 
 
-def drawn(target: Target, frames: list[FrameLight]) -> list[np.ndarray]:
+def drawn_frames(target: Target, frames: list[FrameLight]) -> list[np.ndarray]:
     with Renderer(target) as gl:
         found = []
         for number, sprites in enumerate(frames):
@@ -67,11 +67,11 @@ def both_ways(
     with Renderer(target) as gl:
         if not gl.path.startswith("CPU"):
             pytest.skip(f"{gl.gl_renderer}, OpenGL {gl.gl_version}, shares no memory for `exact`")
-    on_cpu = drawn(target, frames)
+    on_cpu = drawn_frames(target, frames)
     monkeypatch.setenv(WAY_VARIABLE, "gl")
     with Renderer(target) as gl:
         assert gl.path.startswith("points")
-    return on_cpu, drawn(target, frames)
+    return on_cpu, drawn_frames(target, frames)
 
 
 def assert_same(
@@ -115,7 +115,7 @@ def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
 def test_both_ways_choose_the_same_codes(
     quantisation, response, sigma_px, count, per_star, rng, monkeypatch
 ):
-    frames = [stars(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
+    frames = [stars_or_paths(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
     assert_same(
         quantisation,
         *both_ways(
@@ -131,7 +131,7 @@ def test_so_they_do_of_three_primaries_beside_each_other(quantisation, rng, monk
     places_px = np.array([(-0.3, 0), (0, 0.2), (0.3, 0)])
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, primaries=panels)
     target = replace(target, places_px=places_px, together=0.4 + 0.6 * np.eye(3))
-    frames = [stars(count, USUAL, rng) for count in (30, 300)]
+    frames = [stars_or_paths(count, USUAL, rng) for count in (30, 300)]
     for k, one in enumerate(frames):
         light = one.data["electrons_per_s"][:, None] * rng.dirichlet([1, 1, 1], len(one))
         frames[k] = replace(one, primaries=light.astype(np.float32))
@@ -148,7 +148,7 @@ def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, uneven, sides)
     assert_same(
         quantisation,
-        *both_ways(target, [stars(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch),
+        *both_ways(target, [stars_or_paths(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch),
     )
 
 
@@ -157,7 +157,7 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
     one's own.
     """
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
-    frames = [stars(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
+    frames = [stars_or_paths(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
     frames[1] = replace(frames[1], extended=(glow,))
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE)
     assert_same("round", *both_ways(target, frames, monkeypatch))
@@ -169,11 +169,11 @@ def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, smaller, rng):
     """`temporal` chooses among all near pixels, some of which lie a little beyond its reach:
     they are erased too.
     """
-    frames = [stars(600, sigma_px, rng) for _ in range(12)]
+    frames = [stars_or_paths(600, sigma_px, rng) for _ in range(12)]
     side = GaussianPsf(sigma_px).footprint_px
     sides = (SpriteSide(3e38, 2 + side % 2),) if smaller else ()
     target = Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal", sides=sides)
-    for codes, sprites in zip(drawn(target, frames), frames, strict=True):
+    for codes, sprites in zip(drawn_frames(target, frames), frames, strict=True):
         under = np.zeros(SIZE[::-1], dtype=bool)
         for x, y in sprites.data["pixel"] - (side - 1) // 2:
             under[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] = True

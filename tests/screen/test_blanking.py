@@ -66,7 +66,7 @@ def awake(server: Xorg) -> bool:
 
 
 @contextmanager
-def shown(
+def shown_frames_of(
     server: Xorg, folder: Path, name: str = "bench", *options: str
 ) -> Iterator[subprocess.Popen[bytes]]:
     folder.mkdir(exist_ok=True)
@@ -97,7 +97,7 @@ def shown(
     [(signal.SIGINT, ()), (signal.SIGTERM, ("--windowed",)), (signal.SIGKILL, ("--windowed",))],
 )
 def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_path, sign, options):
-    with shown(server, tmp_path, "bench", *options) as process:
+    with shown_frames_of(server, tmp_path, "bench", *options) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)
         assert process.poll() is None, (tmp_path / "bench.txt").read_text()
         process.send_signal(sign)
@@ -108,7 +108,7 @@ def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_p
 
 
 def test_a_kill_of_all_its_processes_restores_too(server, tmp_path):
-    with shown(server, tmp_path) as process:
+    with shown_frames_of(server, tmp_path) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait(PATIENCE_S)
@@ -116,9 +116,9 @@ def test_a_kill_of_all_its_processes_restores_too(server, tmp_path):
 
 
 def test_two_runs_on_one_server_keep_it_awake_until_the_last_ends(server, tmp_path):
-    with shown(server, tmp_path / "one", "one", "--windowed") as one:
+    with shown_frames_of(server, tmp_path / "one", "one", "--windowed") as one:
         wait_for(lambda: awake(server))
-        with shown(server, tmp_path / "two", "two", "--windowed") as two:
+        with shown_frames_of(server, tmp_path / "two", "two", "--windowed") as two:
             wait_for(lambda: "Hz" in (tmp_path / "two" / "two.txt").read_text())
             one.send_signal(signal.SIGINT)
             one.wait(PATIENCE_S)
@@ -128,7 +128,7 @@ def test_two_runs_on_one_server_keep_it_awake_until_the_last_ends(server, tmp_pa
 
 
 def test_what_somebody_sets_meanwhile_is_prevented_and_comes_after(server, tmp_path):
-    with shown(server, tmp_path) as process:
+    with shown_frames_of(server, tmp_path) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)
         xset(server, "s", "120", "300")
         wait_for(lambda: awake(server) or process.poll() is not None)
@@ -191,7 +191,7 @@ def test_standby_is_ended_prevented_and_restored(monkeypatch):
 def test_a_virtual_server_is_kept_awake_too(tmp_path):
     with xvfb(tmp_path, "640x480x24") as screen:
         xset(screen, "s", "600", "300")
-        with shown(screen, tmp_path) as process:
+        with shown_frames_of(screen, tmp_path) as process:
             wait_for(lambda: seen(screen)[0] == "0")
             process.send_signal(signal.SIGINT)
             process.wait(PATIENCE_S)

@@ -38,7 +38,7 @@ def attitude_packet(k, t_ns, q, rate) -> bytes:
     return json.dumps({"t_ns": t_ns, "q": q, "sequence": k}).encode()
 
 
-def turned(degrees: float) -> tuple[float, ...]:
+def turned_q(degrees: float) -> tuple[float, ...]:
     half = math.radians(degrees) / 2
     return (math.cos(half), 0.0, math.sin(half), 0.0)
 
@@ -90,7 +90,7 @@ def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees)
         serving(tmp_path, port, attitude=MOVING) as process,
         CoreWaits(process.pid) as waited,
     ):
-        stream(sender, [(turned(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
+        stream(sender, [(turned_q(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
         process.send_signal(signal.SIGTERM)
         asked_s = time.monotonic()
         summary = summary_of(process)

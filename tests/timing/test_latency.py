@@ -47,7 +47,7 @@ def screen(tmp_path_factory) -> Iterator[Screen]:
 
 
 @contextmanager
-def shown(screen: Screen, folder: Path, kind: str):
+def still_sky(screen: Screen, folder: Path, kind: str):
     """A still sky with the photodiode square, kept in a ledger, while this is open."""
     bench = folder / "bench.toml"
     keys = f'photodiode_px = 40\nphotodiode = "{kind}"\nscanout_ms = 0'
@@ -87,7 +87,7 @@ def measured(
 ) -> tuple[dict, Path]:
     with (
         Cable(folder) as cable,
-        shown(screen, folder, kind) as bench,
+        still_sky(screen, folder, kind) as bench,
         Diode(screen, cable.sender, added_ms, device_clock),
     ):
         diode = ["--diode", f"serial:{cable.host}@921600", "--duration", str(WATCHED_S)]

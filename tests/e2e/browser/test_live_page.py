@@ -141,7 +141,7 @@ def pictures_in_a_second(page: Browser) -> int:
     return page.run_async(COUNT_PICTURES)
 
 
-def events(run: Sky) -> list[EventRecord]:
+def run_events(run: Sky) -> list[EventRecord]:
     return [
         msgspec.json.decode(data, type=EventRecord)
         for data in read_messages(run.folder / "run.mcap", "/event")
@@ -387,8 +387,8 @@ def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
 
 def events_of(run: Sky, kind: str, count: int = 1) -> list[EventRecord]:
     """The events of a kind, once the ledger's writer has put so many of them into the file."""
-    wait_for(lambda: sum(record.kind == kind for record in events(run)) >= count, kind)
-    return [record for record in events(run) if record.kind == kind]
+    wait_for(lambda: sum(record.kind == kind for record in run_events(run)) >= count, kind)
+    return [record for record in run_events(run) if record.kind == kind]
 
 
 def test_controls_act_and_the_ledger_says_who(live, run):
@@ -420,9 +420,10 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     live.until("document.getElementById('control-fault').textContent === 'Inject'")
     live.until("document.body.dataset.ok === 'true'")
     wait_for(
-        lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger"
+        lambda: any("shutter" in record.detail for record in run_events(run)),
+        "the mark in the ledger",
     )
-    mark = next(record for record in events(run) if "shutter" in record.detail)
+    mark = next(record for record in run_events(run) if "shutter" in record.detail)
     assert "Ada Løve" in mark.detail
     assert [(record.detail.split()[-4], record.who) for record in events_of(run, "fault", 2)] == [
         ("begins,", "Ada Løve"),

@@ -49,7 +49,7 @@ def coma_lens(x, y):
     return [(0.7, -0.3 * u, -0.3 * v, 0.55, 0.55), (0.3, 0.7 * u, 0.7 * v, 0.9, 0.9)]
 
 
-def light(parts, x, y, columns, rows):
+def mean_light(parts, x, y, columns, rows):
     """What pixels get of points (n,) through the parts, mean over the points."""
     total = np.zeros((len(rows), len(columns)))
     for weight, off_x, off_y, sx, sy in parts:
@@ -75,7 +75,7 @@ def session(folder, lens):
         at = np.meshgrid(x + POINTS, y + POINTS)
         px, py = tracker.project(monitor.rays(*(part.ravel() for part in at)))
         columns, rows = round(px.mean()) + reach, round(py.mean()) + reach
-        dots.append((columns, rows, light(lens(px.mean(), py.mean()), px, py, columns, rows)))
+        dots.append((columns, rows, mean_light(lens(px.mean(), py.mean()), px, py, columns, rows)))
     for frame in range(plan.frames):
         image = np.zeros((SIZE[1] + 24, SIZE[0] + 24))
         for k in np.flatnonzero(plan.lit[:, frame]):
@@ -116,10 +116,12 @@ def test_the_psf_over_the_field_is_found_without_the_dot(tmp_path, lens, more):
     side = glass.basis.shape[1]
     at = (np.arange(side) - side // 2) / glass.per_px
     for (x, y), found in zip(glass.places_px, glass.images[:, 0, 0], strict=True):
-        wanted = light(lens(x, y), np.zeros(1), np.zeros(1), at, at) / glass.per_px**2
+        wanted = mean_light(lens(x, y), np.zeros(1), np.zeros(1), at, at) / glass.per_px**2
         # centroids in the middle
         off = [float(axis @ at / axis.sum()) for axis in (wanted.sum(axis=0), wanted.sum(axis=1))]
-        wanted = light(lens(x, y), -np.array(off[:1]), -np.array(off[1:]), at, at) / glass.per_px**2
+        wanted = (
+            mean_light(lens(x, y), -np.array(off[:1]), -np.array(off[1:]), at, at) / glass.per_px**2
+        )
         assert 0.5 * np.abs(found - wanted).sum() < ELSEWHERE
         for axis in (0, 1):
             variance, true = (float(image.sum(axis=axis) @ at**2) for image in (found, wanted))

@@ -20,7 +20,7 @@ import pytest
 import hilstar
 from hilstar.instruments.campaign import cluster
 from tests.support.benches import ROOT
-from tests.support.campaigns import read_columns, write_campaign
+from tests.support.campaigns import read_columns, rows_so_far, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here, run_started
 from tests.support.forks import Started
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -107,12 +107,6 @@ def pool_table(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     )
     assert result.returncode == 0, result.stderr
     return (folder / "pool/cases.parquet").read_bytes()
-
-
-def rows_so_far(folder: Path) -> int:
-    return sum(
-        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
-    )
 
 
 @contextlib.contextmanager

@@ -58,7 +58,7 @@ def messages(path: Path) -> dict[str, list[dict]]:
     return found
 
 
-def served(tmp_path, *options: str) -> tuple[Path, dict]:
+def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
     ledger = tmp_path / "run.mcap"
     with (
         publisher() as (sender, port),
@@ -72,7 +72,7 @@ def served(tmp_path, *options: str) -> tuple[Path, dict]:
 
 
 def test_every_packet_and_every_frame_is_there(tmp_path):
-    ledger, summary = served(tmp_path)
+    ledger, summary = served_ledger(tmp_path)
     assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
     found = messages(ledger)
     assert len(found["/attitude"]) == summary["packets"]["received"] == 110
@@ -130,7 +130,7 @@ def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
 
 
 def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
-    ledger, _ = served(tmp_path)
+    ledger, _ = served_ledger(tmp_path)
     samples = read_log(ledger)
     assert len(samples) == 100
     converted = run_hilstar_here("convert", ledger, tmp_path / "run.csv")
@@ -309,7 +309,7 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
 
 
 def test_no_flipped_bit_changes_an_attitude_unsaid(tmp_path, rng):
-    ledger, _ = served(tmp_path)
+    ledger, _ = served_ledger(tmp_path)
     data = ledger.read_bytes()
     truth = [(s.t_ns, *s.q_icrs_to_cam) for s in read_log(ledger)]
     damaged = tmp_path / "damaged.mcap"

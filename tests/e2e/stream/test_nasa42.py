@@ -104,7 +104,7 @@ def test_a_recorded_run_of_42_is_shown_and_every_message_acknowledged(tmp_path):
         assert angle_between_rad(np.array(frame.q), expected) < NUTATED_RAD
 
 
-def turning(seconds: float) -> Rotation:
+def body_turn(seconds: float) -> Rotation:
     """The body after so long: v_B of v_N."""
     return Rotation.from_rotvec(-RATE_RAD_S * seconds) * Rotation.from_euler(
         "zyx", [84, 20, 30], degrees=True
@@ -120,7 +120,8 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
             Nasa42Link(f"tcp://127.0.0.1:{port}", reader) as link,
         ):
             steps = (
-                message(k * STEP_S, turning(k * STEP_S), RATE_RAD_S).encode() for k in range(10**6)
+                message(k * STEP_S, body_turn(k * STEP_S), RATE_RAD_S).encode()
+                for k in range(10**6)
             )
 
             def simulate() -> None:
@@ -138,7 +139,7 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
     assert len(shown) > 60
     assert summary.packets.refused == 0
     for t_ns, attitude in shown:
-        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning(
+        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * body_turn(
             (t_ns - BEGIN_NS) / 1e9
         )
         assert (
@@ -151,7 +152,7 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
     twice.
     """
     drawn = []
-    steps = [message(36.0 * k, turning(float(k)), RATE_RAD_S).encode() for k in range(200)]
+    steps = [message(36.0 * k, body_turn(float(k)), RATE_RAD_S).encode() for k in range(200)]
     with (
         server() as listener,
         load(bench_of(tmp_path, "lockstep = true")) as bench,
@@ -174,7 +175,7 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
     assert [(t_ns - BEGIN_NS) // 36_000_000_000 for t_ns, _ in drawn] == list(range(200))
     assert summary.packets.refused == 1
     for k, (_, attitude) in enumerate(drawn):
-        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning(float(k))
+        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * body_turn(float(k))
         assert (
             Rotation.from_quat(attitude.q_icrs_to_cam, scalar_first=True) * expected.inv()
         ).magnitude() < FOLLOWED_RAD

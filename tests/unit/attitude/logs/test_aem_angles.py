@@ -14,7 +14,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.rotation import to_matrix
-from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, aem_refusal, kvn, read, rows_of
 
 # Angles are written with 17 digits; three turns of them are a few roundings of 1 rad.
 MATRIX_TOLERANCE = 2e-14
@@ -27,7 +27,7 @@ AXES = {"X": "1", "Y": "2", "Z": "3"}
 SEQUENCES = [a + b + c for a in AXES for b in AXES for c in AXES if a != b != c]
 
 
-def camera(seconds=0.0, first=None):
+def camera_turn_from(seconds=0.0, first=None):
     """Of cam's components into ICRS components."""
     return (first or Rotation.from_quat([0.1, -0.5, 0.7, 0.3])) * Rotation.from_rotvec(
         RATE_CAM_RAD_S * seconds
@@ -69,7 +69,7 @@ CASES = [("1.0", "A2B"), ("1.0", "B2A"), ("2.0", "A2B")]
 def test_each_sequence_of_euler_angles_is_scipys(tmp_path, frame_a, version, direction, names):
     rng = np.random.default_rng(SEQUENCES.index(names))
     for first in Rotation.random(4, random_state=rng):
-        rotation, _ = placed(frame_a, direction, camera(0.0, first))
+        rotation, _ = placed(frame_a, direction, camera_turn_from(0.0, first))
         written = "".join(AXES[name] for name in names) if version == "1.0" else names
         meta = keywords(version, frame_a, direction, written, ATTITUDE_TYPE="EULER_ANGLE")
         (sample,) = read(tmp_path, kvn(rows_of(angles_deg(rotation, names)), version, **meta))
@@ -83,14 +83,14 @@ def test_each_sequence_of_euler_angles_is_scipys(tmp_path, frame_a, version, dir
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
 def test_the_angles_derivatives_give_the_rate_of_the_camera(tmp_path, frame_a, names):
     before, angles, after = (
-        angles_deg(placed(frame_a, "A2B", camera(s))[0], names) for s in (-H_S, 0.0, H_S)
+        angles_deg(placed(frame_a, "A2B", camera_turn_from(s))[0], names) for s in (-H_S, 0.0, H_S)
     )
     turned = (after - before + 180.0) % 360.0 - 180.0
     row = np.concatenate([angles, turned / (2 * H_S)])
     meta = keywords("2.0", frame_a, "A2B", names, ATTITUDE_TYPE="EULER_ANGLE/DERIVATIVE")
     (sample,) = read(tmp_path, kvn(rows_of(row), "2.0", **meta))
     assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
-        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+        camera_turn_from().inv().as_matrix(), abs=MATRIX_TOLERANCE
     )
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=RATE_TOLERANCE_RAD_S)
 
@@ -100,10 +100,10 @@ def test_the_angles_derivatives_give_the_rate_of_the_camera(tmp_path, frame_a, n
 def test_an_angular_velocity_beside_euler_angles_gives_the_rate_of_the_camera(
     tmp_path, frame_a, resolved_in
 ):
-    rotation, to_cam = placed(frame_a, "A2B", camera())
+    rotation, to_cam = placed(frame_a, "A2B", camera_turn_from())
     rate = RATE_CAM_RAD_S if to_cam else -RATE_CAM_RAD_S
     if resolved_in == "ICRF":
-        rate = camera().apply(rate)
+        rate = camera_turn_from().apply(rate)
     row = np.concatenate([angles_deg(rotation, "ZYX"), np.degrees(rate)])
     meta = keywords(
         "2.0", frame_a, "A2B", "ZYX", ATTITUDE_TYPE="EULER_ANGLE/ANGVEL", ANGVEL_FRAME=resolved_in
@@ -320,7 +320,7 @@ def test_xml_whose_angles_are_not_those_of_the_sequence_is_refused(tmp_path):
     )
     angles = f"<rotationAngles>{turns('angle', 'XYZ')}</rotationAngles>"
     state = f"<eulerAngle><EPOCH>{EPOCHS[0]}</EPOCH>{angles}</eulerAngle>"
-    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in refusal(
+    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in aem_refusal(
         tmp_path, xml_of("1.0", text, state)
     )
 
@@ -330,8 +330,9 @@ def test_a_sequence_that_is_none_is_refused(tmp_path, names):
     text = kvn(
         rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", names, ATTITUDE_TYPE="EULER_ANGLE")
     )
-    assert f"EULER_ROT_SEQ is {names or 'missing'}; write three axes such as 321 or ZYX" in refusal(
-        tmp_path, text
+    assert (
+        f"EULER_ROT_SEQ is {names or 'missing'}; write three axes such as 321 or ZYX"
+        in aem_refusal(tmp_path, text)
     )
 
 
@@ -377,4 +378,4 @@ def test_blocks_of_two_frames_of_the_spacecraft_are_refused(tmp_path):
         kvn(rows_of([0, 0, 0, 1]), REF_FRAME_B=frame) for frame in ("SC_BODY_1", "STARTRACKER_1")
     )
     text = one + two[two.index("META_START") :].replace("2024-02-29", "2024-02-28")
-    assert "the spacecraft's frame changes from block to block" in refusal(tmp_path, text)
+    assert "the spacecraft's frame changes from block to block" in aem_refusal(tmp_path, text)

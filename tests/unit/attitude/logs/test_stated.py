@@ -157,7 +157,7 @@ def test_json_lines_of_each_convention(tmp_path, scalar, direction, frame):
     assert sample.rate_cam_rad_s == pytest.approx(rate, abs=ROUNDING)
 
 
-def turning(folder: Path, sent: Convention) -> Path:
+def turning_log(folder: Path, sent: Convention) -> Path:
     """A log of a steady turn with rates, its quaternions sent in a convention."""
     path, rate_rad_s = folder / "turning.jsonl", np.array([0.02, 0.05, -0.03])
     lines = []
@@ -195,17 +195,17 @@ def test_a_log_that_is_read_otherwise_is_told_what_to_state_in_place_of_what_is(
     tmp_path, stated, advice
 ):
     sent = Convention(scalar="last", direction="cam_to_icrs")
-    told = dict(open_log(turning(tmp_path, sent), stated).joins().told)
+    told = dict(open_log(turning_log(tmp_path, sent), stated).joins().told)
     assert told["convention-wrong"].endswith(advice)
 
 
 def test_a_log_that_is_read_as_it_was_sent_is_told_nothing(tmp_path):
     sent = Convention(scalar="last", direction="cam_to_icrs")
-    assert open_log(turning(tmp_path, sent), Stated(convention=sent)).joins().told == []
+    assert open_log(turning_log(tmp_path, sent), Stated(convention=sent)).joins().told == []
 
 
 def test_a_log_with_a_convention_of_its_own_is_told_no_statement_that_it_refuses(tmp_path):
-    log = open_log(turning(tmp_path, Convention(direction="cam_to_icrs")))
+    log = open_log(turning_log(tmp_path, Convention(direction="cam_to_icrs")))
     path = tmp_path / "conjugates.aem"
     write_log(path, log.samples)
     told = dict(open_log(path).joins().told)

@@ -51,7 +51,7 @@ MAX_RMS_SIGMAS = 1.5
 GRID = 9
 
 
-def planted(folder, tilt_deg=0.0):
+def tilted_screen(folder, tilt_deg=0.0):
     """A bench file and the screen as it truly stands."""
     (folder / "bench.toml").write_text(bench_text(SMALL_FIELD))
     file = read_bench_file(folder / "bench.toml")
@@ -98,7 +98,7 @@ def test_a_model_is_compared_in_few_steps_by_the_error_of_many(
     """Half of first light's time went to fits that crept along a bent valley, for a choice
     between models that differ by 2 % and more.
     """
-    problem, data = dots_of(*planted(tmp_path, tilt_deg=2.0), 3, 0.01)
+    problem, data = dots_of(*tilted_screen(tmp_path, tilt_deg=2.0), 3, 0.01)
     steps = []
     slopes = geometric_fit._Loss.slopes
 
@@ -132,13 +132,13 @@ def test_a_lens_that_noise_hides_is_in_the_error_of_a_pinhole(tmp_path):
     """A tilt of 2.5 degrees: the covariance of a pinhole's four numbers alone is half of its
     error.
     """
-    file, seen = planted(tmp_path, tilt_deg=2.5)
+    file, seen = tilted_screen(tmp_path, tilt_deg=2.5)
     off = [error_of(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
 
 
 def test_dots_with_errors_of_their_own_are_not_averaged_over_frames(tmp_path):
-    file, seen = planted(tmp_path, tilt_deg=3.0)
+    file, seen = tilted_screen(tmp_path, tilt_deg=3.0)
     off = [
         error_of(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02)
         for seed in range(SEEDS)
@@ -166,7 +166,7 @@ def test_a_larger_model_is_taken_for_more_than_chance(is_chance, chosen):
 
 @pytest.mark.parametrize("psf_sigma_px", [0.5, 2.8])
 def test_no_dot_is_planned_whose_window_leaves_the_image(tmp_path, psf_sigma_px):
-    _, seen = planted(tmp_path)
+    _, seen = tilted_screen(tmp_path)
     seen = dataclasses.replace(seen, psf_sigma_px=psf_sigma_px)
     plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
     x, y = seen.tracker.project(

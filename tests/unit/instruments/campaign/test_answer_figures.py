@@ -78,7 +78,7 @@ def answers(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Col
     return Columns(cases, numbers, {}, lists)
 
 
-def stars(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Columns:
+def reported_stars(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Columns:
     """Reported stars with planted errors: px, magnitudes, and false stars a frame."""
     lists: dict[str, list[Any]] = {name: [] for name in STAR_LISTS}
     false = rng.poisson(planted.get("false", 0.2), cases)
@@ -118,11 +118,11 @@ PLANTED: dict[str, tuple[Any, Any, float]] = {
     "time-bias": (answers, lambda size: {"stamp_bias": size}, 0.02),
     "time-jitter": (answers, lambda size: {"stamp_jitter": size}, 0.02),
     "aberration": (answers, lambda size: {"aberration": size}, 1.0),
-    "star-noise": (stars, lambda size: {"noise": size}, 0.3),
-    "star-fov-error": (stars, lambda size: {"fov": size}, 0.3),
-    "star-colour": (stars, lambda size: {"colour": size}, 0.1),
-    "star-limit": (stars, lambda size: {"limit": size}, 5.0),
-    "false-stars": (stars, lambda size: {"false": size}, 2.0),
+    "star-noise": (reported_stars, lambda size: {"noise": size}, 0.3),
+    "star-fov-error": (reported_stars, lambda size: {"fov": size}, 0.3),
+    "star-colour": (reported_stars, lambda size: {"colour": size}, 0.1),
+    "star-limit": (reported_stars, lambda size: {"limit": size}, 5.0),
+    "false-stars": (reported_stars, lambda size: {"false": size}, 2.0),
 }
 
 
@@ -164,7 +164,7 @@ def test_no_false_star_in_so_many_frames_bounds_them_by_the_rule_of_three(
     rng: np.random.Generator,
 ) -> None:
     """None seen of a Poisson process: at most -ln 0.05 = 3.00 in all, at 95 %."""
-    found = verdict(stars(rng, false=0.0), "false-stars", maximum=0.1)
+    found = verdict(reported_stars(rng, false=0.0), "false-stars", maximum=0.1)
     assert (found.value, found.low) == (0.0, 0.0)
     assert found.high == pytest.approx(-math.log(0.05) / CASES, rel=1e-6)
 

@@ -33,7 +33,7 @@ def photographs(rng, levels_e, prnu=PRNU):
         yield np.rint((charge_e + READ_E * rng.standard_normal(SHAPE)) / GAIN)
 
 
-def fitted(images, bench=BENCH):
+def fitted_transfer(images, bench=BENCH):
     images = list(images)
     levels = [sky_level(dn, 1.0).level for dn in images]
     points = [transfer_points(dn, level, EVERY) for dn, level in zip(images, levels, strict=True)]
@@ -49,7 +49,7 @@ def test_one_photograph_does_not_tell_the_gain_from_the_response(rng, ramp_e):
     it no better.
     """
     levels_e = SKY_E + ramp_e * np.linspace(-0.5, 0.5, SHAPE[1])
-    pixels = fitted(photographs(rng, [levels_e]))
+    pixels = fitted_transfer(photographs(rng, [levels_e]))
     assert pixels.gain_e_per_dn == GAIN
     assert not pixels.gain_told
     assert "gain_e_per_dn" not in pixels.sigma
@@ -61,7 +61,7 @@ def test_one_photograph_does_not_tell_the_gain_from_the_response(rng, ramp_e):
 
 
 def test_several_photographs_of_one_level_tell_the_gain_with_its_sigma(rng):
-    pixels = fitted(
+    pixels = fitted_transfer(
         photographs(rng, [SKY_E] * 4), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E)
     )
     assert pixels.gain_told
@@ -74,7 +74,7 @@ def test_columns_are_no_share_of_the_response(rng):
     """A column's mean has its pixels' response in it: 1.5 DN of columns were stated, where there
     are none.
     """
-    pixels = fitted(photographs(rng, [SKY_E] * 4))
+    pixels = fitted_transfer(photographs(rng, [SKY_E] * 4))
     assert pixels.pattern.rms[0] == pytest.approx(PRNU, rel=0.02)
     assert pixels.pattern.rms[2:] == (0.0, 0.0)
 
@@ -82,7 +82,7 @@ def test_columns_are_no_share_of_the_response(rng):
 def test_one_photograph_of_levels_that_differ_widely_tells_the_gain(rng):
     """From 200 to 30 000 e- shot noise and response part: the gain is the photograph's own."""
     levels_e = np.geomspace(200.0, 30_000.0, SHAPE[1])
-    pixels = fitted(
+    pixels = fitted_transfer(
         photographs(rng, [levels_e]), DetectorSettings(gain_e_per_dn=24, read_noise_e=READ_E)
     )
     assert pixels.gain_told
@@ -90,7 +90,7 @@ def test_one_photograph_of_levels_that_differ_widely_tells_the_gain(rng):
 
 
 def test_a_gain_too_small_for_the_noise_is_named_with_the_least_that_is_possible(rng):
-    pixels = fitted(
+    pixels = fitted_transfer(
         photographs(rng, [SKY_E], prnu=0.0), DetectorSettings(gain_e_per_dn=5, read_noise_e=READ_E)
     )
     assert pixels.gain_e_per_dn == 5

@@ -135,7 +135,7 @@ def zemax(folder: Path) -> Path:
     return folder / "tilted.zmx"
 
 
-def frames(parts):
+def surface_frames(parts):
     """The rotation, origin and surface of each surface; Zemax turns about x, the new y, the
     newer z, or backwards.
     """
@@ -157,7 +157,7 @@ def frames(parts):
 def snell(at, along, um):
     """Places and directions (3, n) at the image, by Snell's law in vectors."""
     index = 1.0
-    for turn, origin, (radius, _, glass, conic, fourth) in frames(TILTED):
+    for turn, origin, (radius, _, glass, conic, fourth) in surface_frames(TILTED):
         at, along = turn.T @ (at - origin[:, None]), turn.T @ along
         far = -at[2] / along[2]
         for _ in range(20):  # Newton
@@ -181,8 +181,8 @@ def snell(at, along, um):
 def test_breaks_keep_zemax_s_order(tmp_path):
     """All surfaces stand where shifts and turns in Zemax's order put them."""
     lens = read_zemax(zemax(tmp_path).read_bytes())
-    assert len(lens.surfaces) == len(list(frames(TILTED)))
-    for surface, (turn, origin, _) in zip(lens.surfaces, frames(TILTED), strict=True):
+    assert len(lens.surfaces) == len(list(surface_frames(TILTED)))
+    for surface, (turn, origin, _) in zip(lens.surfaces, surface_frames(TILTED), strict=True):
         assert surface.turn == pytest.approx(turn, abs=1e-12)
         assert surface.origin_mm == pytest.approx(origin, abs=1e-12)
 

@@ -11,12 +11,12 @@ import pytest
 from astropy.io import fits
 from scipy.ndimage import uniform_filter
 
-from hilstar.basics.errors import InputError
 from hilstar.optics.camera import Lens
 from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of, read_glass, write_glass
 from hilstar.optics.psf import SampledPsf
 from hilstar.sky.spectrum import Curve
 from tests.support.glass import stack
+from tests.support.refusals import refusal
 
 FLOAT32 = 1e-6  # of the largest sample: the basis is float32
 
@@ -120,10 +120,7 @@ def put(place, value):
     ],
 )
 def test_what_is_no_glass_is_one_line(change, advice):
-    with pytest.raises(InputError) as said:
-        glass_of(change(stack(2, (450.0, 650.0))))
-    assert advice in str(said.value)
-    assert "\n" not in str(said.value)
+    assert advice in refusal(glass_of, change(stack(2, (450.0, 650.0))))
 
 
 @pytest.mark.parametrize(
@@ -153,16 +150,14 @@ def test_a_file_that_another_program_spoilt_is_one_line(tmp_path, header, table,
         ]
         spoilt_table = fits.BinTableHDU.from_columns(columns, name="POINTS")
         fits.HDUList([hdus[0], spoilt_table]).writeto(tmp_path / "bad.fits")
-    with pytest.raises(InputError) as said:
-        read_glass(tmp_path / "bad.fits")
-    assert advice in str(said.value)
-    assert "bad.fits" in str(said.value)
+    line = refusal(read_glass, tmp_path / "bad.fits")
+    assert advice in line
+    assert "bad.fits" in line
 
 
 def test_a_cube_of_images_without_points_is_refused_as_before(tmp_path):
     fits.writeto(tmp_path / "cube.fits", np.ones((3, 5, 5)))
-    with pytest.raises(InputError, match="holds 3 images"):
-        read_glass(tmp_path / "cube.fits")
+    assert "holds 3 images" in refusal(read_glass, tmp_path / "cube.fits")
 
 
 def test_images_without_wavelengths_count_for_all_light():

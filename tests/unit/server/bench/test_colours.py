@@ -23,6 +23,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.console.overlay import colour_notes
 from hilstar.tracker.mosaic import luminance
 from tests.support.benches import ORION_Q, TWIN, bench_text
+from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
 from tests.unit.display.test_primaries import NM, PANELS, bump, written
@@ -34,7 +35,7 @@ STRIPES = {
     "rgb-stripe": [(-THIRD, 0), (0, 0), (THIRD, 0)],
     "vertical": [(0, -THIRD), (0, 0), (0, THIRD)],
 }
-CENTROID_PX = 0.005  # the aim; measured 1e-4 with 16 bits
+CENTROID_PX = 0.005  # the aim
 CHANNEL_MAG = 0.02  # the 2 %; measured 8e-4 at 95 % of stars
 # at least: of a star that is red or blue alone a third, of one in three channels less
 UNCORRECTED_PX = 0.1
@@ -94,9 +95,8 @@ def test_all_light_of_a_star_has_one_centroid_whatever_its_colour(tmp_path, layo
     with load(bench_path(tmp_path, change, channels=channels)) as bench:
         frame = bench.frame(ORION_Q)
         off = centroids(frame, bench, STRIPES[layout])
-        assert (
-            frame.codes.shape == (240, 320, 3) and len(off) > 10 and np.abs(off).max() < CENTROID_PX
-        )
+        assert frame.codes.shape == (240, 320, 3) and len(off) > 10
+        holds("one-centroid", np.abs(off).max())
     with load(
         bench_path(tmp_path, change, {"monitor.primaries": {"layout": "white"}}, channels=channels)
     ) as bench:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin
 
 from typer import Typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
@@ -137,25 +137,22 @@ def section(name: str, command: Callable[..., Any]) -> str:
 
 def parameters_of(command: Callable[..., Any]) -> Iterator[Parameter]:
     """The arguments and options in the order of the function's signature."""
-    hints = get_type_hints(command, include_extras=True)
     for name, parameter in inspect.signature(command).parameters.items():
-        kind, *notes = get_args(hints[name])
-        info = next(note for note in notes if isinstance(note, ParameterInfo))
+        info = parameter.default
+        if not isinstance(info, ParameterInfo):
+            raise TypeError(f"{name}: is neither an option nor an argument of typer's")
         if info.hidden:
             continue
-        flags = flags_of(name, info) if isinstance(info, OptionInfo) else ()
-        value = "" if kind is bool else info.metavar or type_word(kind, name, info)
-        required = parameter.default is inspect.Parameter.empty
-        yield Parameter(flags, value, meaning_of(info), default_text(parameter.default), required)
-
-
-def flags_of(name: str, info: OptionInfo) -> tuple[str, ...]:
-    """`-o`, `--output`: what is written on the command line. Within Annotated typer has the
-    first of them as `default`.
-    """
-    words = (info.default, *(info.param_decls or ()))
-    written = tuple(word for word in words if isinstance(word, str) and word.startswith("-"))
-    return written or (f"--{name.replace('_', '-')}",)
+        kind = parameter.annotation
+        flags: tuple[str, ...] = ()
+        if isinstance(info, OptionInfo):
+            flags = tuple(info.param_decls or ())
+        value = ""
+        if kind is not bool:
+            value = info.metavar or type_word(kind, name, info)
+        is_required = info.default is ...
+        default = "" if is_required else default_text(info.default)
+        yield Parameter(flags, value, meaning_of(info), default, is_required)
 
 
 def type_word(kind: Any, name: str, info: ParameterInfo) -> str:
@@ -186,7 +183,7 @@ def meaning_of(info: ParameterInfo) -> str:
 
 def default_text(default: Any) -> str:
     """A default that says something: no flag's False, no None, no empty text."""
-    if default is inspect.Parameter.empty or default is None or default is False or default == "":
+    if default is None or default is False or default == "":
         return ""
     return (
         f"{default:g}"

@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.version import __version__
+from hilstar.cli.declare import for_typer
 
 # By their panels, each a file of this folder and its function.
 COMMANDS = {
@@ -96,7 +97,7 @@ def hilstar(
 def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None:
     """Add the command of a function `name` in a file of this folder."""
     function = getattr(import_module(f"hilstar.cli.{file}"), name)
-    to.command(public(name), rich_help_panel=panel)(function)
+    to.command(public(name), rich_help_panel=panel)(for_typer(function))
 
 
 def public(name: str) -> str:
@@ -108,6 +109,14 @@ def names() -> list[str]:
     """The commands and groups, as `hilstar --help` orders them."""
     alone = [public(name) for panel in COMMANDS.values() for name in panel]
     return [*alone, *GROUPS]
+
+
+def members(group: str) -> list[str]:
+    """A group's own commands; none for the name of a command."""
+    if group not in GROUPS:
+        return []
+    _, _, functions = GROUPS[group]
+    return [public(name) for name in functions]
 
 
 @cache

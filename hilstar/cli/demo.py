@@ -6,17 +6,18 @@ import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
-from typer import Option
 
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import check_directory, make_directory, temporary_folder
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import caught
 from hilstar.cli import running
-from hilstar.cli.options import Json, seed_option
+from hilstar.cli.declare import option, struct, switch
+from hilstar.cli.options import json_option, output_option, seed_option
+from hilstar.cli.running import ActingPageOptions
 from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.console.terminal import progress, report, say
 
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     from hilstar.server.bench.frame import Bench
     from hilstar.server.console.listener import PageListener
     from hilstar.server.frame_feed import FrameFeed
-    from hilstar.server.pacer import FrameSink
+    from hilstar.server.pacer import FrameSink, Shown
     from hilstar.server.serve import Outlet
+    from hilstar.server.summary import RunSummary
 
 HZ = 60  # the demo bench's refresh
 USUAL_S, LOOP_S = 10.0, 60.0
@@ -44,33 +46,22 @@ PLANTED = [
 PLANTED += ["--wrong", str(WRONG)]
 
 
-def demo(
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="DIR", help="Directory for the pictures.")
-    ] = Path("hilstar-demo"),
-    duration: Annotated[
-        float | None,
-        Option(
-            metavar="SECONDS",
-            help="Seconds to run; by default 10, and 60 with --loop.",
-            min=0.5,
-            max=600,
-        ),
-    ] = None,
-    loop: Annotated[
-        bool,
-        Option(
-            "--loop",
-            help="A slow scan with a virtual tracker before the display, and its error budget.",
-        ),
-    ] = False,
-    seed: Annotated[int, seed_option("Seed of the jitter, and of the tracker's errors.")] = 1,
-    console: running.Console = None,
-    control: running.Control = False,
-    token: running.Token = None,
-    console_name: running.ConsoleName = None,
-    as_json: Json = False,
-) -> None:
+@struct
+class DemoOptions:
+    """The options of `hilstar demo`."""
+
+    output: Path = output_option("DIR", "Directory for the pictures.", default=Path("hilstar-demo"))
+    duration: float | None = option(
+        "SECONDS", "Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600
+    )
+    loop: bool = switch(
+        "A slow scan with a virtual tracker before the display, and its error budget."
+    )
+    seed: int = seed_option("Seed of the jitter, and of the tracker's errors.", default=1)
+    as_json: bool = json_option()
+
+
+def demo(options: DemoOptions, page: ActingPageOptions) -> None:
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket,
     frames out.
 
@@ -82,58 +73,72 @@ def demo(
     from hilstar.basics.resources import resource_path
     from hilstar.server.demo import Shows, run_demo, scan_samples, slew_samples, write_pictures
 
-    check_directory("-o", output)
-    seconds = duration or (LOOP_S if loop else USUAL_S)
-    samples = (scan_samples if loop else slew_samples)(seconds + 1.0, np.random.default_rng(seed))
+    check_directory("-o", options.output)
+    seconds = options.duration or (LOOP_S if options.loop else USUAL_S)
+    rng = np.random.default_rng(options.seed)
+    motion = scan_samples if options.loop else slew_samples
+    samples = motion(seconds + 1.0, rng)
     demo_file = resource_path("configs", "demo.toml")
+    beside: AbstractContextManager[TrackerBeside | None] = nullcontext()
+    if options.loop:
+        beside = tracker_beside(options.output, demo_file, seconds, options.seed)
     with (
-        running.page_listener(console, control, token, console_name) as listener,
-        tracker_beside(output, demo_file, seconds, seed) if loop else nullcontext() as tracker,
+        running.page_listener(page) as listener,
+        beside as tracker,
         progress("serving", seconds * HZ) as advance,
     ):
+
+        def counted(shown: "Shown") -> None:
+            advance(shown.number + 1)
 
         def watching(
             bench: "Bench", endpoint: str
         ) -> "AbstractContextManager[tuple[FrameSink, Outlet]]":
-            return _watching(
-                bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker
-            )
+            return _watching(bench, endpoint, listener, page.control, counted, tracker)
 
-        if tracker is None:
-            shows = Shows(demo_file, samples)
-        else:
+        shows = Shows(demo_file, samples)
+        if tracker is not None:
             shows = Shows(tracker.bench_file, samples, tracker.watches)
-        result = run_demo(output, seconds, shows, watching)
+        result = run_demo(options.output, seconds, shows, watching)
     if result.kept and caught() is None:  # no pictures after Ctrl-C
-        if not as_json:
-            say(f"writing {len(result.kept)} pictures and their previews to {output}")
+        if not options.as_json:
+            say(f"writing {len(result.kept)} pictures and their previews to {options.output}")
         with progress("writing pictures", 2 * len(result.kept)) as advance:
-            write_pictures(output, result, advance)
-    report(result.summary, as_json)
+            write_pictures(options.output, result, advance)
+    report(result.summary, options.as_json)
     if tracker is not None and caught() is None:
-        tracker.report(result.summary.answers, as_json)
-        missed = result.summary.missed_frames
-        if missed > MAX_MISSED * result.summary.frames:
-            line = (
-                f"the display missed {missed} frames, and answers that looked while it held a frame"
-                " are in no figure"
-            )
-            say(f"hilstar: {line}; the machine is busy: close other programs, and run it again")
-    if not as_json:
+        tracker.report(result.summary.answers, options.as_json)
+        _say_missed(result.summary)
+    if not options.as_json:
         typer.echo(
-            f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png"
-            " (stretched)"
+            f"{'pictures':20}{options.output}/frame_*_codes.png (what the monitor gets),"
+            " _preview.png (stretched)"
         )
     if result.summary.stale_frames and caught() is None:
-        line = (
-            f"{result.summary.stale_frames} of {result.summary.frames} frames show an old sky: no"
-            " attitude came in time; the machine is busy, so close other programs and run it again"
-        )
-        if as_json:
-            say(f"hilstar: {line}")
-        else:
-            typer.echo(f"{'stale sky':20}{line}")
+        _say_stale(result.summary, options.as_json)
         raise typer.Exit(1)
+
+
+def _say_missed(summary: "RunSummary") -> None:
+    """Say where the display missed frames that the tracker's budget takes for its own errors."""
+    missed = summary.missed_frames
+    if missed > MAX_MISSED * summary.frames:
+        say(
+            f"hilstar: the display missed {missed} frames, and answers that looked while it held a"
+            " frame are in no figure; the machine is busy: close other programs, and run it again"
+        )
+
+
+def _say_stale(summary: "RunSummary", as_json: bool) -> None:
+    """Say that frames showed an old sky; on stderr where stdout is the JSON object's."""
+    line = (
+        f"{summary.stale_frames} of {summary.frames} frames show an old sky: no attitude came in"
+        " time; the machine is busy, so close other programs and run it again"
+    )
+    if as_json:
+        say(f"hilstar: {line}")
+    else:
+        typer.echo(f"{'stale sky':20}{line}")
 
 
 @contextmanager
@@ -150,17 +155,18 @@ def _watching(
     from hilstar.server.serve import Outlet
 
     notices = Notices()
-    status = RunStatus(
-        RunSource(
-            f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-        )
-    )
+    refresh_hz = bench.config.monitor.refresh_hz
+    source = RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, refresh_hz)
+    status = RunStatus(source)
+    ledger_path = None
+    frames_endpoint = None
+    if tracker is not None:
+        ledger_path = tracker.ledger
+        frames_endpoint = FREE_PORT
     with (
-        running.optional_ledger(
-            None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT
-        ) as ledger,
+        running.optional_ledger(ledger_path, bench, notices, True, NO_SPLIT) as ledger,
         running.optional_answers(bench, notices, ledger, None) as answers,
-        running.optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
+        running.optional_frames(frames_endpoint, bench, None) as frames,
         nullcontext() if tracker is None or frames is None else tracker.before(frames),
     ):
         parts = running.page_parts(bench, notices, ledger, answers=answers)
@@ -170,12 +176,10 @@ def _watching(
             follower,
             requests,
         ):
-            yield (
-                sink,
-                Outlet(
-                    None, ledger, notices, follower=follower, requests=requests, answers=answers
-                ),
+            outlet = Outlet(
+                None, ledger, notices, follower=follower, requests=requests, answers=answers
             )
+            yield sink, outlet
     running.refuse_lost_gpu(notices)
 
 

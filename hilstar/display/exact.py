@@ -44,6 +44,26 @@ MAX_SIZE = 63  # largest footprint whose places fit into six bits
 EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 
 
+class Turn(NamedTuple):
+    """The turn of a panel among those of one monitor, which choose their levels one after another.
+
+    A star makes up in it for these shares `makes_up` of the errors that it left in the panels
+    before, in their order, in steps of both. Where it `is_followed`, the next panel makes up for
+    what it leaves itself.
+    """
+
+    makes_up: tuple[float, ...] = ()
+    is_followed: bool = False
+
+    @property
+    def kept(self) -> int:
+        """How many choices are kept side by side."""
+        return KEPT_BEFORE if self.is_followed else KEPT
+
+
+ALONE = Turn()
+
+
 @dataclass(frozen=True, slots=True)
 class Carried:
     """The errors (SUMS, n) that earlier sprites or frames left and n sprites have to make up for,
@@ -104,10 +124,8 @@ class ExactQuantiser(quantise.Quantiser):
     weights: ClassVar[Weights] = IN_A_FRAME
     remembers: ClassVar[bool] = False
     left: Left | None = None
-    # For so much of what these quantisers of other primaries left in the same frame each star makes
-    # up, in steps of both.
-    given: Sequence[tuple[float, quantise.Quantiser]] = ()
-    kept = KEPT
+    turn: Turn = ALONE
+    before: Sequence["ExactQuantiser"] = ()  # of the panels before, as in `turn`
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
     def __init__(
@@ -225,9 +243,11 @@ class ExactQuantiser(quantise.Quantiser):
         none.
         """
         carried = nothing_carried(len(sprites))
-        for part, other in self.given if sprites.per_star == 1 else ():
-            if part and isinstance(other, ExactQuantiser) and other.over is not None:
-                np.add(carried.error, np.float32(part) * other.over, out=carried.error)
+        if sprites.per_star > 1:
+            return carried
+        for share, panel in zip(self.turn.makes_up, self.before, strict=True):
+            if panel.over is not None:
+                np.add(carried.error, np.float32(share) * panel.over, out=carried.error)
         return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
@@ -276,7 +296,7 @@ class ExactQuantiser(quantise.Quantiser):
         error[0] -= hidden
         weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(weights.moments))])
         error[:3] *= weight
-        up, remainder = _decide(short, step, arm, error, weights.last_light, self.kept)
+        up, remainder = _decide(short, step, arm, error, weights.last_light, self.turn.kept)
         _turn_one_more(step, arm, up, remainder, grid)
         remainder[:3] /= weight
         remainder[0] += hidden
@@ -442,15 +462,3 @@ def _turn_one_more(
     can = np.flatnonzero(np.isfinite(more.min(axis=0)))
     up[pixel[can], stars[can]] ^= True
     error[:, stars[can]] += arm[:, pixel[can], can] * by[pixel[can], can]
-
-
-class Turn(NamedTuple):
-    """The turn of one panel of a target, whose panels are quantised one after the other.
-
-    Stars make up in it for the share `makes_up` [panel] of the errors that they left in each panel
-    before, in steps of both. `kept` is how many of the choices tried are kept.
-    """
-
-    plane: int
-    makes_up: list[float]
-    kept: int = KEPT

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,9 @@ from hilstar.basics.notices import Notices
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import Quantisation
 from hilstar.display.quantisers import QUANTISERS
-from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.backend import Backend
+from hilstar.display.render.context import create_context
+from hilstar.display.render.numpy_backend import open_backend
 from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.render.way import WAY_VARIABLE
 from hilstar.display.response import gamma_response, srgb_response
@@ -49,13 +52,17 @@ def stars_or_paths(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
     return replace(packed, per_star=per_star)
 
 
+def opened(target: Target) -> closing[Backend]:
+    return closing(open_backend(target, create_context()))
+
+
 def drawn_frames(target: Target, frames: list[FrameLight]) -> list[np.ndarray]:
-    with Renderer(target) as gl:
+    with opened(target) as gl:
         found = []
         for number, sprites in enumerate(frames):
             gl.draw(sprites, number)
             found.append(gl.levels().copy())
-        assert gl.gl_error() == "GL_NO_ERROR"
+        assert gl.fault() == ""
     return found
 
 
@@ -64,12 +71,12 @@ def both_ways(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The codes of frames on the CPU, and by points."""
     monkeypatch.setenv(WAY_VARIABLE, "cpu")
-    with Renderer(target) as gl:
+    with opened(target) as gl:
         if not gl.path.startswith("CPU"):
             pytest.skip(f"{gl.gl_renderer}, OpenGL {gl.gl_version}, shares no memory for `exact`")
     on_cpu = drawn_frames(target, frames)
     monkeypatch.setenv(WAY_VARIABLE, "gl")
-    with Renderer(target) as gl:
+    with opened(target) as gl:
         assert gl.path.startswith("points")
     return on_cpu, drawn_frames(target, frames)
 

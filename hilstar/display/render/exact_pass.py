@@ -5,6 +5,7 @@ With `temporal` what each star leaves is kept on the GPU from frame to frame.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -13,23 +14,22 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.display.balance import SUMS, Balance
-from hilstar.display.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left, Turn
+from hilstar.display.exact import CARRIED, ExactQuantiser, Left
 from hilstar.display.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
+from hilstar.display.panel import Panel
 from hilstar.display.render.context import pinned
 from hilstar.display.render.encoder import (
     LevelTexture,
     LookupTable,
     Shares,
     build_compute,
-    linear_format,
-    set_planes,
     set_uniforms,
     write,
 )
-from hilstar.display.render.target import Planes, Target
+from hilstar.display.render.target import Target
 from hilstar.display.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.optics.psf import PIXEL_VARIANCE
-from hilstar.optics.sprites import FrameLight
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of
@@ -44,7 +44,8 @@ LOCAL_SIZE = 32  # as in exact.comp
 TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 3, 7, 8
 # runs of stars are sorted by light; runs times half octaves fill 16 bits
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32
-FIRST_BINDING = 4  # first binding of a Memory's buffers
+FIRST_BINDING = 4  # first binding of a Memory's buffers, and of what panels before left
+LEFT_BINDING = 6
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
 SUMS_BYTES = 4 * SUMS
 
@@ -56,27 +57,23 @@ class PixelSums:
     context, which is current in every call.
     """
 
-    def __init__(self, planes: Planes, levels: LevelTexture) -> None:
+    def __init__(self, levels: LevelTexture) -> None:
         ctx = levels.texture.ctx
-        self._planes = planes
         self._levels = levels
-        count = math.prod(levels.texture.size) * len(planes.panels)
-        self.values, self._memory = pinned(ctx, (count,), np.int32)
-        self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
+        self.values, self._memory = pinned(ctx, (math.prod(levels.texture.size),), np.int32)
+        self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
         self.floor: LevelTexture | None = None
-        self._unit_e_per_s: list[float] = []
+        self._unit_e_per_s = 0.0
 
-    def upload(
-        self, sprites: FrameLight, unit_e_per_s: list[float], floor: LevelTexture | None
-    ) -> None:
-        """Take the sprites of a frame, the units of its sums, and the floor that it stands on."""
+    def upload(self, sprites: FrameLight, unit_e_per_s: float, floor: LevelTexture | None) -> None:
+        """Take the sprites of a frame, the unit of its sums, and the floor that it stands on."""
         write(self.sprites, sprites.data)
         self._unit_e_per_s = unit_e_per_s
         self.floor = floor
 
     def bind(self, program: moderngl.ComputeShader) -> None:
         """Let a program look at the sums (see shaders/sums.glsl) and change levels."""
-        set_planes(self._planes, program, unit_e_per_s=self._unit_e_per_s)
+        set_uniforms(program, {"unit_e_per_s": self._unit_e_per_s})
         self._memory.bind_to_storage_buffer(SUMS_BINDING)
         if self._levels.memory is not None:
             self._levels.memory.bind_to_storage_buffer(LEVELS_BINDING)
@@ -85,30 +82,31 @@ class PixelSums:
 
 
 class ExactPass:
-    """Chooses the levels of stars by a compute shader, on a plane of a LevelTexture that has the
-    nearest levels.
+    """Chooses the levels of stars by a compute shader, on a LevelTexture that has the nearest
+    levels.
 
-    `turn` says on which plane, and for which errors of the planes before stars make up on it;
-    `left` is a buffer for the errors that all planes leave. It lives in its renderer's context.
+    `before` are the passes of the panels before, for whose errors stars make up as the target's
+    `turn` has it. It lives in its renderer's context.
     """
 
     def __init__(
         self,
         quantiser: type[ExactQuantiser],
         target: Target,
-        planes: Planes,
-        turn: Turn,
+        panel: Panel,
+        before: Sequence["ExactPass"],
         *,
         linear: moderngl.Texture,
         levels: LevelTexture,
         shares: Shares,
-        left: moderngl.Buffer | None,
     ) -> None:
         ctx = self._ctx = linear.ctx
-        self.plane, self._makes_up, self._kept = turn
-        panel = planes.panels[self.plane]
-        self._planes = planes
-        self._together = left
+        self._turn = target.turn
+        self._before = before
+        # What the last frame's stars leave to the next panel, and how many they are: none where
+        # they are paths, or where NumPy has drawn them.
+        self._over = ctx.buffer(reserve=SUMS_BYTES, dynamic=True)
+        self._over_count = 0
         balance = Balance(target.psf, target.seen, quantiser.weights)
         self._linear = linear
         self._levels = levels.texture
@@ -141,16 +139,12 @@ class ExactPass:
         order = self._pixels
         panel = self._panel
         balance = self._balance
-        together = self._together is not None and not paths
+        before = 0 if paths else len(self._before)
         defines = [
             f"NEAR {order.near}",
+            f"KEPT {self._turn.kept}",
+            f"BEFORE {before}",
             *self._level_defines,
-            f"LINEAR {linear_format(self._planes)}",
-        ]
-        defines += [
-            f"PLANE {self.plane}",
-            f"KEPT {self._kept}",
-            *self._planes.defines,
             *self._shares.defines,
         ]
         defines += [
@@ -162,12 +156,8 @@ class ExactPass:
         narrow = min(balance.psf.width_px) < NARROW_PX
         uneven = self._gain is not None
         whether = {
-            "MAKES_UP": any(self._makes_up),
-            "LEAVES": self._kept == KEPT_BEFORE,
-            "TOGETHER": together,
+            "LEAVES": self._turn.is_followed and not paths,
             "NARROW": narrow,
-        }
-        whether |= {
             "PATHS": paths,
             "UNIFORMITY": uneven,
             "TEMPORAL": self._memory is not None,
@@ -175,10 +165,9 @@ class ExactPass:
             "FLOOR": floor,
         }
         defines += [name for name, is_so in whether.items() if is_so]
-        files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
+        files = (*["sums.glsl"] * summed, *PARTS)
         program = build_compute(self._ctx, self._quantiser.shader, defines, files)
         self._shares.set(program)
-        set_planes(self._planes, program, makes_up=self._makes_up)
         window = balance.window_px
         weights = balance.weights
         values: dict[str, Any] = {
@@ -256,11 +245,8 @@ class ExactPass:
             self._memory.bind(sprites.star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:
             self._memory.bind(sprites.star, np.zeros(count, dtype=np.bool_))
-        elif self._together is not None:
-            size = count * len(self._planes.panels) * SUMS_BYTES
-            if self._together.size < size:
-                self._together.orphan(2 * size)
-            self._together.bind_to_storage_buffer(FIRST_BINDING + 2)
+        elif not paths:
+            self._bind_before(program, count)
         buffer.bind_to_storage_buffer(0)
         self._order.bind()
         self._light.bind()
@@ -272,6 +258,24 @@ class ExactPass:
         self._ctx.memory_barrier()
         if sums is not None:
             self._ctx.finish()  # before NumPy looks at the levels
+
+    def forget_over(self) -> None:
+        """The stars of the next frame leave nothing, unless this pass draws them."""
+        self._over_count = 0
+
+    def _bind_before(self, program: moderngl.ComputeShader, count: int) -> None:
+        """Bind what `count` stars left in the panels before, and room for what they leave here."""
+        makes_up = [0.0, 0.0]  # as many as inputs.glsl has
+        for place, panel in enumerate(self._before):
+            panel._over.bind_to_storage_buffer(FIRST_BINDING + place)
+            if panel._over_count == count:
+                makes_up[place] = self._turn.makes_up[place]
+        set_uniforms(program, {"makes_up": tuple(makes_up)})
+        if self._turn.is_followed:
+            if self._over.size < count * SUMS_BYTES:
+                self._over.orphan(2 * count * SUMS_BYTES)
+            self._over.bind_to_storage_buffer(LEFT_BINDING)
+            self._over_count = count
 
 
 class Memory:

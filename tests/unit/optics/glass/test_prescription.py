@@ -9,6 +9,7 @@ import re
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -464,3 +465,32 @@ def test_a_constant_index_and_a_glass_without_numbers_are_traced(tmp_path):
     result = traced_here(tmp_path, "lens.zmx", data, "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["focal_length_mm"] == pytest.approx(100.031, abs=1e-3)
+
+
+def test_the_camera_of_chief_rays_has_browns_coefficients_of_its_rays():
+    """The rays of a camera with radial and decentring distortion, in place of a traced lens."""
+    k1, k2, k3, p1, p2 = -0.31, 0.24, -0.5, 2e-3, -3e-3
+    focal_mm = 55.0
+
+    def chiefs(fields, um):
+        x, y = (0.2 * fields).T
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        bent = np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=1,
+        )
+        places_mm = focal_mm * bent
+        places_mm[3] = np.nan  # a ray that an aperture stops
+        return 0.2 * fields, places_mm
+
+    rays = SimpleNamespace(max_field=1.0, primary_um=0.55, chiefs=chiefs)
+    camera = prescription._Chiefs.of(rays)
+    assert camera.focal_length_mm == pytest.approx(focal_mm, rel=1e-9)
+    assert camera.lens.radial == pytest.approx((k1, k2, k3), rel=1e-6)
+    assert camera.lens.tangential == pytest.approx((p1, p2), rel=1e-6)
+    on_axis = SimpleNamespace(max_field=0, focal_length_mm=40.0)
+    assert prescription._Chiefs.of(on_axis) == prescription._Chiefs(40.0, None)

@@ -43,7 +43,7 @@ LIT_TOLERANCE = 0.02  # 96 rays across count a circle of half their width to 2 %
 CHIEF_PX, RAY_CENTROID_PX, RMS = 5e-4, 0.003, 0.01  # the limits; measured 3e-4 px of 10 um
 
 
-def made(folder: Path, *options: object):
+def traced_psf(folder: Path, *options: object):
     lens = folder / "lens.json"
     if not lens.exists():
         lens.write_text("{}")
@@ -51,15 +51,19 @@ def made(folder: Path, *options: object):
 
 
 def test_it_says_what_it_lacks(tmp_path, monkeypatch):
-    assert_refused(made(tmp_path), 2, "--bench BENCH.toml, or --pitch-um and --resolution")
-    assert_refused(made(tmp_path, "--pitch-um", 5, "--resolution", "0,5"), 2, "--resolution 0,5")
+    assert_refused(traced_psf(tmp_path), 2, "--bench BENCH.toml, or --pitch-um and --resolution")
+    assert_refused(
+        traced_psf(tmp_path, "--pitch-um", 5, "--resolution", "0,5"), 2, "--resolution 0,5"
+    )
     monkeypatch.setitem(sys.modules, "optiland", None)
-    assert_refused(made(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 3, "hilstar[lens]")
+    assert_refused(
+        traced_psf(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 3, "hilstar[lens]"
+    )
 
 
 def test_a_file_that_is_no_lens_is_one_line(tmp_path):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
-    assert_refused(made(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 2, "lens.json")
+    assert_refused(traced_psf(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 2, "lens.json")
 
 
 def test_a_triplet_is_what_its_rays_are(tmp_path):
@@ -69,7 +73,7 @@ def test_a_triplet_is_what_its_rays_are(tmp_path):
 
     lens = CookeTriplet()
     save_optiland_file(lens, str(tmp_path / "lens.json"))
-    result = made(
+    result = traced_psf(
         tmp_path, "--pitch-um", PITCH_UM, "--resolution", SIZE, "--half-px", 5, "--oversampling", 8
     )
     assert result.returncode == 0, result.stderr

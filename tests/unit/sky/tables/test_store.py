@@ -34,7 +34,7 @@ def rewritten(path, **changes):
     np.savez(path.with_suffix(""), **arrays)
 
 
-def same(a, b):
+def is_same_catalogue(a, b):
     return all(
         np.array_equal(getattr(a, n), getattr(b, n), equal_nan=getattr(a, n).dtype.kind == "f")
         for n in column_names()
@@ -94,7 +94,7 @@ def test_a_damaged_or_hostile_cache_is_made_anew(table):
     ]
     for k, harm in enumerate(damage):
         harm()
-        assert same(choose_catalog(TableChoice(table)), whole), k
+        assert is_same_catalogue(choose_catalog(TableChoice(table)), whole), k
         if path.is_file():
             assert path.read_bytes() == good, k
 

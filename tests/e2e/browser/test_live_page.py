@@ -13,16 +13,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 import hilstar
-from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.server.record.ledger_records import EventRecord
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
+from tests.support.ledgers import read_events
 from tests.support.senders import ORION, connected, packet
 from tests.support.servers import Served, bound
 from tests.support.waiting import CHANCES, CoreWaits, repeating, wait_for
@@ -142,10 +141,7 @@ def pictures_in_a_second(page: Browser) -> int:
 
 
 def run_events(run: RunBeforeSky) -> list[EventRecord]:
-    return [
-        msgspec.json.decode(data, type=EventRecord)
-        for data in read_messages(run.folder / "run.mcap", "/event")
-    ]
+    return read_events(run.folder / "run.mcap")
 
 
 def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):

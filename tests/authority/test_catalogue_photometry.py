@@ -28,7 +28,7 @@ TYCHO_MEDIAN_MAG, TYCHO_BIN_MAG, TYCHO_STAR_MAG = 0.009, 0.02, 0.06
 GAIA_ZERO_MAG, GAIA_MEDIAN_MAG, GAIA_STAR_MAG, GAIA_VI_MAG, COOL_MAG = 0.03, 0.02, 0.06, 0.12, 2.5
 
 
-def columns(name: str) -> dict[str, np.ndarray]:
+def photometry_columns(name: str) -> dict[str, np.ndarray]:
     lines = [line for line in (HERE / name).read_text().splitlines() if not line.startswith("#")]
     rows = list(csv.DictReader(lines))
     return {
@@ -37,7 +37,7 @@ def columns(name: str) -> dict[str, np.ndarray]:
 
 
 def test_tycho_magnitudes_become_those_of_the_ground():
-    stars = columns("tycho_photometry.csv")
+    stars = photometry_columns("tycho_photometry.csv")
     v, bv = from_tycho(stars["bt_mag"], stars["vt_mag"])
     colour = stars["bt_mag"] - stars["vt_mag"]
     for ours, theirs in ((v, stars["v_mag"]), (bv, stars["bv_mag"])):
@@ -72,7 +72,7 @@ def test_beyond_its_range_tycho_s_relation_goes_on_without_a_step():
 
 
 def test_gaia_magnitudes_become_those_of_the_spectra():
-    stars = columns("gaia_photometry.csv")
+    stars = photometry_columns("gaia_photometry.csv")
     library = load_library()
     v, vi = from_gaia(stars["g_mag"], stars["bp_mag"] - stars["rp_mag"])
     plain = stars["bp_mag"] - stars["rp_mag"] < COOL_MAG

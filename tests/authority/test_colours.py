@@ -204,7 +204,7 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
         (x, y, one, 0.0) for x in (0, side / 2, side) for y in (0, side / 2, side) for one in nm
     ]
     lateral = [
-        (1.0, 0.0, *(0.2 * moved(one) * (2 * place / side - 1) for place in (x, y)))
+        (1.0, 0.0, *(0.2 * moved_share(one) * (2 * place / side - 1) for place in (x, y)))
         for x, y, one, _ in places
     ]
     dot = np.exp(-(at**2 + at[:, None] ** 2) / 0.5)
@@ -224,7 +224,9 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
         )
     _, of_primaries = photons_of_panel("lcd", curves)
     _, of_stars = photons_of_stars(stars.temperature_k, curves)
-    primaries, sky = (one @ moved(GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars))
+    primaries, sky = (
+        one @ moved_share(GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars)
+    )
     spread, off, plain = (
         np.std(one)
         for one in (sky, shares @ primaries - sky, without.stars.primaries @ primaries - sky)
@@ -238,6 +240,6 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
     assert np.abs(shares @ means[0] - means[1]).max() < 60
 
 
-def moved(nm):
+def moved_share(nm):
     """By how much light of a wavelength is moved at the edge of the field."""
     return ((nm - 560) / 100) ** 2 - 0.3 * (nm - 560) / 100

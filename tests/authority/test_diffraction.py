@@ -29,7 +29,7 @@ BASE = {
 }
 
 
-def image(per_px: int = 8, **keys) -> np.ndarray:
+def diffraction_image(per_px: int = 8, **keys) -> np.ndarray:
     found = diffracted(Pupil(**(BASE | keys)), per_px).images[0]
     return found / found.sum()
 
@@ -63,7 +63,7 @@ def test_zernike_terms_are_those_of_poppy_s_own_optical_system():
     sines.
     """
     terms = tuple(Term(kind="zernike", noll=noll, nm=nm) for noll, nm in TERMS.items())
-    found = image(terms=terms, obstruction=0.3, spiders=4, spider_width_mm=0.6)
+    found = diffraction_image(terms=terms, obstruction=0.3, spiders=4, spider_width_mm=0.6)
     coefficients = np.zeros(11)
     for noll, nm in TERMS.items():
         coefficients[noll - 1] = nm * 1e-9
@@ -96,7 +96,7 @@ def test_large_aberrations_have_the_second_moments_of_rays(kind, spread):
     x, y = (part[np.hypot(*np.meshgrid(at, at)) <= 1] for part in np.meshgrid(at, at))
     widths = []
     for nm in (0.0, 1500.0):
-        light = image(half_px=12, terms=(Term(kind=kind, nm=nm),))
+        light = diffraction_image(half_px=12, terms=(Term(kind=kind, nm=nm),))
         at_px = (np.arange(len(light)) - len(light) // 2) / 8
         core = np.abs(at_px) < 12
         widths.append(light.sum(axis=0)[core] @ at_px[core] ** 2 / light.sum())
@@ -122,8 +122,8 @@ def test_coma_leads_to_the_axis_and_turns_with_the_field():
 
 def test_focus_and_field_curvature_cancel_where_the_image_is():
     """W020 of focus is focus / 8 N^2: at N = 2 a lag of 550 nm is in focus 17.6 um behind."""
-    sharp = image(terms=(Term(kind="W020", nm=-550.0),), focuses_um=(17.6,))
-    assert sharp == pytest.approx(image(), abs=1e-6)
+    sharp = diffraction_image(terms=(Term(kind="W020", nm=-550.0),), focuses_um=(17.6,))
+    assert sharp == pytest.approx(diffraction_image(), abs=1e-6)
 
 
 TEMPERATURES_K = (3300.0, 4500.0, 5800.0, 9600.0, 20_000.0)

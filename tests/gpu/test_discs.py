@@ -64,7 +64,7 @@ def sun_from(direction: np.ndarray, phase_deg: float) -> np.ndarray:
     return -np.cos(np.radians(phase_deg)) * direction + np.sin(np.radians(phase_deg)) * side
 
 
-def moon(radius_px: float, phase_deg: float, cam: Camera, polar: float = 1.0) -> Disc:
+def moon_disc(radius_px: float, phase_deg: float, cam: Camera, polar: float = 1.0) -> Disc:
     direction = towards(30.3, 31.9, cam)
     pole, sun = np.array([0.6, 0.8, 0.0]), sun_from(direction, phase_deg)
     distance = 1 / np.sin(radius_px / cam.focal_length_px)
@@ -119,7 +119,7 @@ def centroid_px(picture: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("phase_deg", [0.0, 30.0, 60.0, 90.0, 120.0, 150.0])
 def test_the_moon_s_light_and_limb_at_six_phases_are_those_of_rays(gl, rng, radius_px, phase_deg):
     cam = long_camera()
-    disc = moon(radius_px, phase_deg, cam)
+    disc = moon_disc(radius_px, phase_deg, cam)
     got = drawn_discs(gl, *lights(disc, cam))
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng, finer=5)
     holds("disc-light", 100 * abs(got.sum() / truth.sum() - 1))
@@ -134,7 +134,7 @@ def test_the_moon_s_light_and_limb_at_six_phases_are_those_of_rays(gl, rng, radi
 @pytest.mark.parametrize("polar", [1.0, 0.9], ids=["sphere", "Saturn's flattening"])
 def test_a_disc_through_a_lens_is_where_the_lens_has_it(gl, rng, polar):
     cam = long_camera(100.0, LENS)  # the corner is 0.4 of tangent off: the lens moves it by 1 px
-    disc = moon(14.0, 50.0, cam, polar)
+    disc = moon_disc(14.0, 50.0, cam, polar)
     got = drawn_discs(gl, *lights(disc, cam))
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
@@ -193,7 +193,7 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
 @pytest.mark.parametrize("sigma_px", [(0.3, 3.5), (0.2, 0.2), (3.0, 3.0)])
 def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
     cam = long_camera()
-    disc = moon(4.8, 40.0, cam)
+    disc = moon_disc(4.8, 40.0, cam)
     view = DiscView(cam, GaussianPsf(sigma_px), (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, GaussianPsf(sigma_px))) as gl:
         got = drawn_discs(gl, *disc_lights(disc, view, covers=True))

@@ -40,7 +40,7 @@ RESPONSES = {
 TIE = 4 * np.finfo(np.float32).eps
 
 
-def uneven(rng) -> np.ndarray:
+def uneven_map(rng) -> np.ndarray:
     return rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32)
 
 
@@ -71,7 +71,7 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear
     image are one thing.
     """
-    target = target_of(response, method, uneven(rng) if mapped else None)
+    target = target_of(response, method, uneven_map(rng) if mapped else None)
     panel = target.panel()
     with Renderer(target) as gl:
         sprites = random_sprites(count, rng, SIZE, gl.footprint_px)
@@ -145,7 +145,7 @@ def apart(count, rng, footprint):
 @pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES)
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
 def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
-    target = target_of(response, "exact", uneven(rng) if mapped else None)
+    target = target_of(response, "exact", uneven_map(rng) if mapped else None)
     panel = target.panel()
     with Renderer(target) as gl:
         for count in (130, 20):

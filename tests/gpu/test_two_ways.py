@@ -81,7 +81,7 @@ def both_ways(
     return on_cpu, drawn_frames(target, frames)
 
 
-def assert_same(
+def assert_same_codes(
     quantisation: Quantisation, on_cpu: list[np.ndarray], by_points: list[np.ndarray]
 ) -> None:
     """Both add the same whole units, whose last bits a driver's exp2 decides: of few pixels is the
@@ -123,7 +123,7 @@ def test_both_ways_choose_the_same_codes(
     quantisation, response, sigma_px, count, per_star, rng, monkeypatch
 ):
     frames = [stars_or_paths(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
-    assert_same(
+    assert_same_codes(
         quantisation,
         *both_ways(
             Target(SIZE, GaussianPsf(sigma_px), response, WHITE, quantisation), frames, monkeypatch
@@ -142,7 +142,7 @@ def test_so_they_do_of_three_primaries_beside_each_other(quantisation, rng, monk
     for k, one in enumerate(frames):
         light = one.data["electrons_per_s"][:, None] * rng.dirichlet([1, 1, 1], len(one))
         frames[k] = replace(one, primaries=light.astype(np.float32))
-    assert_same(quantisation, *both_ways(target, frames, monkeypatch))
+    assert_same_codes(quantisation, *both_ways(target, frames, monkeypatch))
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact"])
@@ -153,7 +153,7 @@ def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(
     uneven = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if changed == "uneven" else None
     sides = shrunk(USUAL) if changed == "smaller sprites" else ()
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, uneven, sides)
-    assert_same(
+    assert_same_codes(
         quantisation,
         *both_ways(target, [stars_or_paths(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch),
     )
@@ -167,7 +167,7 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
     frames = [stars_or_paths(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
     frames[1] = replace(frames[1], extended=(glow,))
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE)
-    assert_same("round", *both_ways(target, frames, monkeypatch))
+    assert_same_codes("round", *both_ways(target, frames, monkeypatch))
 
 
 @pytest.mark.parametrize("smaller", [False, True], ids=["whole", "smaller sprites"])
@@ -187,7 +187,7 @@ def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, smaller, rng):
         assert not codes[~under].any()
 
 
-def replayed(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[str], DrawnBy]:
+def replayed_codes(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[str], DrawnBy]:
     """The codes of each frame of a replay, what was told of another renderer, and who drew it."""
     codes, told = {}, []
 
@@ -220,15 +220,15 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     path.write_text(bench_text({"render": {"quantisation": quantisation}}))
     turn = [(k / 10, math.cos(0.01 * k), math.sin(0.01 * k)) for k in range(6)]
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},{w},{x},0,0\n" for t, w, x in turn))
-    first, told, before = replayed(path, log, ledger)
+    first, told, before = replayed_codes(path, log, ledger)
     assert not told
-    again, told, _ = replayed(path, ledger)
+    again, told, _ = replayed_codes(path, ledger)
     assert not told
     assert all(np.array_equal(first[number], again[number]) for number in first)
     if not before.path.startswith("CPU"):
         pytest.skip(f"{before} draws one way only")
     monkeypatch.setenv(WAY_VARIABLE, "gl")
-    by_points, told, now = replayed(path, ledger)
+    by_points, told, now = replayed_codes(path, ledger)
     assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
     assert before.other_codes(now, quantisation) == QUANTISERS[quantisation].other_codes
     for number, codes in first.items():

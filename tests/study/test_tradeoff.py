@@ -72,7 +72,7 @@ def study(tmp_path_factory):
     )
 
 
-def error_of(step, method):
+def method_error(step, method):
     return float(step[method]["error"])
 
 
@@ -149,7 +149,7 @@ def test_less_is_worse(study):
     steps = study[2]
 
     def falls(step, *methods):
-        errors = [error_of(steps[step], method) for method in methods]
+        errors = [method_error(steps[step], method) for method in methods]
         assert all(worse > better for worse, better in itertools.pairwise(errors)), (
             methods,
             errors,

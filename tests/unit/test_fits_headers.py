@@ -40,7 +40,7 @@ def file_of(*hdus) -> bytes:
     return buffer.getvalue()
 
 
-def image(cards: dict | list, pattern: str = "RGGB", kind=fits.PrimaryHDU) -> fits.PrimaryHDU:
+def mosaic_hdu(cards: dict | list, pattern: str = "RGGB", kind=fits.PrimaryHDU) -> fits.PrimaryHDU:
     made = kind(mosaic(pattern))
     for key, value in dict(cards).items():
         made.header[key] = value
@@ -48,7 +48,7 @@ def image(cards: dict | list, pattern: str = "RGGB", kind=fits.PrimaryHDU) -> fi
 
 
 def read_image(cards: dict, pattern: str = "RGGB"):
-    return read_fits_image(file_of(image(cards, pattern)))
+    return read_fits_image(file_of(mosaic_hdu(cards, pattern)))
 
 
 @pytest.mark.parametrize(
@@ -274,7 +274,7 @@ def test_a_binned_mosaic_is_said():
 )
 def test_planes_have_the_names_of_their_colours(tmp_path: Path, pixels, cards):
     path = tmp_path / "mosaic.fits"
-    path.write_bytes(file_of(image(cards, pixels)))
+    path.write_bytes(file_of(mosaic_hdu(cards, pixels)))
     planes = {photo.plane: int(photo.dn.mean()) // 1000 for photo in read_photographs(path, None)}
     assert planes == {"r": 1, "g1": 2, "g2": 2, "b": 3}
 
@@ -289,7 +289,7 @@ def test_a_grey_image_is_one_plane(value):
 )
 def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
     path = tmp_path / "mosaic.fits"
-    path.write_bytes(file_of(image({"BAYERPAT": value})))
+    path.write_bytes(file_of(mosaic_hdu({"BAYERPAT": value})))
     with pytest.raises(
         InputError,
         match=r"mosaic\.fits: BAYERPAT is .*a mosaic of a kind that is not read; write RGGB",
@@ -306,7 +306,7 @@ def test_a_layout_that_is_none_is_refused(cards):
 
 
 def test_rows_from_the_bottom_are_turned_over():
-    given = image({"ROWORDER": "BOTTOM-UP"})
+    given = mosaic_hdu({"ROWORDER": "BOTTOM-UP"})
     assert (read_fits_image(file_of(given)).pixels == given.data[::-1]).all()
 
 
@@ -339,7 +339,9 @@ def test_an_extension_s_own_keywords_count_first(own):
 
 
 def test_the_first_of_several_images_is_taken_and_said():
-    found = read_fits_image(file_of(image({}), fits.ImageHDU(np.zeros((8, 8), dtype=np.uint8))))
+    found = read_fits_image(
+        file_of(mosaic_hdu({}), fits.ImageHDU(np.zeros((8, 8), dtype=np.uint8)))
+    )
     assert found.pixels.shape == (SIDE_PX, SIDE_PX)
     assert found.notes == ("holds 2 images, of which the first is taken",)
 
@@ -349,7 +351,7 @@ def test_the_first_of_several_images_is_taken_and_said():
 )
 def test_a_packed_file_is_the_same_image(tmp_path: Path, reader):
     plain, packed = tmp_path / "a.fits", tmp_path / "a.fits.gz"
-    plain.write_bytes(file_of(image({})))
+    plain.write_bytes(file_of(mosaic_hdu({})))
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     assert (reader(plain) == reader(packed)).all()
     packed.write_bytes(gzip.compress(plain.read_bytes())[:-40])

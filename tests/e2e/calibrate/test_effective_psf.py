@@ -63,7 +63,7 @@ def mean_light(parts, x, y, columns, rows):
     return total
 
 
-def session(folder, lens):
+def psf_session(folder, lens):
     (folder / "bench.toml").write_text(FILE)
     wanted = "--frames", "16", "--dots", "14", "-o", folder / "plan"
     assert run_hilstar_here("calibrate", "dots", folder / "bench.toml", *wanted).returncode == 0
@@ -103,7 +103,7 @@ def calibrated(folder, *options):
 
 @pytest.mark.parametrize(("lens", "more"), [(round_lens, False), (coma_lens, True)])
 def test_the_psf_over_the_field_is_found_without_the_dot(tmp_path, lens, more):
-    session(tmp_path, lens)
+    psf_session(tmp_path, lens)
     result = calibrated(tmp_path, "--json", "--plot", tmp_path / "psf.png")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
@@ -132,7 +132,7 @@ ELSEWHERE, VARIANCE = 0.035, 0.06  # measured: 0.025 and 0.04, at corners that f
 
 
 def test_images_without_the_plan_s_dots_are_one_line(tmp_path):
-    session(tmp_path, round_lens)
+    psf_session(tmp_path, round_lens)
     for path in tmp_path.glob("frame_*.png"):
         Image.fromarray(np.asarray(Image.open(path))[::-1].copy()).save(path)
     assert_refused(calibrated(tmp_path), 2, "flip_y")

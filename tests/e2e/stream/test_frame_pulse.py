@@ -37,7 +37,7 @@ def server():
         yield server
 
 
-def replayed(tmp_path, bench_file):
+def replayed_pulses(tmp_path, bench_file):
     log = still_log(tmp_path / "still.csv")
     kept = ("--ledger", tmp_path / "run.mcap")
     done = run_hilstar_here(
@@ -50,7 +50,7 @@ def replayed(tmp_path, bench_file):
 @pytest.mark.timing
 def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, server):
     with CoreWaits(os.getpid()) as waited:
-        summary, _ = replayed(tmp_path, pulse_bench(tmp_path, server.url, pulse_ms=20))
+        summary, _ = replayed_pulses(tmp_path, pulse_bench(tmp_path, server.url, pulse_ms=20))
     told, pulses = summary["sync"], server.pulses()
     assert told["port"] == server.url
     assert (
@@ -78,7 +78,7 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
 
     thread = threading.Thread(target=cut, daemon=True)
     thread.start()
-    summary, said = replayed(tmp_path, pulse_bench(tmp_path, f"{server.url}?timeout=0.3"))
+    summary, said = replayed_pulses(tmp_path, pulse_bench(tmp_path, f"{server.url}?timeout=0.3"))
     thread.join()
     assert summary["sync"]["lost"] == 1 and summary["sync"]["pulses"] >= 1
     assert summary["frames"] + summary["missed_frames"] >= int(SECONDS * REFRESH_HZ)

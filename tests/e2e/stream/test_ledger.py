@@ -35,7 +35,7 @@ RATE = (0.0, 0.0, 0.1)
 LIMIT_BYTES = 20_000
 
 
-def stream(sender, count: int) -> None:
+def send_turn(sender, count: int) -> None:
     """A turn at 100 Hz, on a bench clock that stood at 50 s when it began; a wrong packet after
     each tenth.
     """
@@ -65,7 +65,7 @@ def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
         serving(tmp_path, port, "--ledger", str(ledger), *options) as process,
     ):
         process.shows()
-        stream(sender, 100)
+        send_turn(sender, 100)
         process.has_received(110)
         process.send_signal(signal.SIGINT)
         return ledger, summary_of(process)
@@ -151,7 +151,7 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
         process.shows()
         with CoreWaits(process.pid) as waited:
-            stream(sender, 150)
+            send_turn(sender, 150)
             process.kill()
             process.wait()
     found, frames = read_log(ledger), list(drawable_frames(ledger))
@@ -194,7 +194,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
             assert process.stderr is not None
             process.stderr.readline()
             await_subscriber(sender)
-            stream(sender, 200)
+            send_turn(sender, 200)
             out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1, err
     summary = json.loads(out)

@@ -49,7 +49,7 @@ def as_packet(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float, ...]) 
     return packet(k, t_ns, q, rate)
 
 
-def as_json(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float, ...]) -> bytes:
+def json_with_rate(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float, ...]) -> bytes:
     return json.dumps({"t_ns": t_ns, "q": q, "rate": rate, "sequence": k}).encode()
 
 
@@ -101,7 +101,7 @@ def run_of(small_bench_file, tmp_path, check: str, form=as_packet) -> tuple[list
     return errors, msgspec.to_builtins(summary)
 
 
-@pytest.mark.parametrize("form", [as_packet, as_json, as_json_uncounted])
+@pytest.mark.parametrize("form", [as_packet, json_with_rate, as_json_uncounted])
 def test_a_rate_in_deg_s_is_told_and_the_quaternions_turn_is_drawn(
     small_bench_file, tmp_path, form, caplog
 ):

@@ -57,7 +57,7 @@ def kept(monkeypatch):
     return made
 
 
-def settings(**keys):
+def pulse_settings(**keys):
     return SyncSettings(port="loop://", **keys)
 
 
@@ -72,7 +72,7 @@ def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_en
     kept, active
 ):
     high = active == "high"
-    with FramePulse(Line(high), settings(active=active, pulse_ms=3.0), Notices()) as pulse:
+    with FramePulse(Line(high), pulse_settings(active=active, pulse_ms=3.0), Notices()) as pulse:
         for number in range(12):
             pulsed_frames(pulse, 1, number)
             wait_for(
@@ -99,7 +99,7 @@ def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_en
 
 def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
     stamps = []
-    with FramePulse(Line(), settings(), Notices()) as pulse:
+    with FramePulse(Line(), pulse_settings(), Notices()) as pulse:
         for number in range(12):
             # swapped 2 ms ago, as far as the driver knows
             stamps.append(time.monotonic_ns() - 2_000_000)
@@ -115,7 +115,7 @@ def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
 
 
 def test_of_every_third_frame(kept):
-    with FramePulse(Line(), settings(every_frames=3), Notices()) as pulse:
+    with FramePulse(Line(), pulse_settings(every_frames=3), Notices()) as pulse:
         pulsed_frames(pulse, 9, first=1)
     summary = pulse.summary()
     assert summary.pulses + summary.skipped == 3
@@ -124,7 +124,7 @@ def test_of_every_third_frame(kept):
 @pytest.mark.timing
 def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
     line = Line()
-    with FramePulse(line, settings(), Notices()) as pulse:
+    with FramePulse(line, pulse_settings(), Notices()) as pulse:
         line.slow_s = 0.1
         begin_s, asked_s = time.thread_time(), time.monotonic()
         costs_s = []
@@ -146,7 +146,7 @@ def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
 
 def test_a_line_that_is_lost_is_told_once_and_tried_until_it_is_back(kept):
     notices, line = Notices(), Line()
-    with FramePulse(line, settings(), notices) as pulse:
+    with FramePulse(line, pulse_settings(), notices) as pulse:
         pulsed_frames(pulse, 2)
         line.gone = True
         pulsed_frames(pulse, 10)

@@ -223,7 +223,7 @@ def xml_of(version, text, state):
 """
 
 
-def turns(what, names):
+def angle_elements(what, names):
     values = zip(names, (10.0, 20.0, -30.0), strict=True)
     return "".join(
         f'<rotation{k} {what}="{n}_{what.upper()}">{v}</rotation{k}>'
@@ -231,7 +231,7 @@ def turns(what, names):
     )
 
 
-def flat(names, values):
+def elements(names, values):
     return "".join(
         f"<{name}>{value}</{name}>" for name, value in zip(names.split(), values, strict=True)
     )
@@ -247,7 +247,7 @@ XML_CASES = [
         "313",
         "eulerAngle",
         ANGLES,
-        f"<rotationAngles>{turns('angle', 'ZXZ')}</rotationAngles>",
+        f"<rotationAngles>{angle_elements('angle', 'ZXZ')}</rotationAngles>",
     ),
     (
         "1.0",
@@ -256,26 +256,35 @@ XML_CASES = [
         "eulerAngleRate",
         (*ANGLES, 1.0, 2.0, 3.0),
         (
-            f"<rotationAngles>{turns('angle', 'ZYX')}</rotationAngles><rotationRates>{turns('rate', 'ZYX')}</rotationRates>"
+            f"<rotationAngles>{angle_elements('angle', 'ZYX')}</rotationAngles><rotationRates>{angle_elements('rate', 'ZYX')}</rotationRates>"
         ),
     ),
-    ("1.0", "SPIN", None, "spin", SPIN_VALUES, flat(SPIN_NAMES, SPIN_VALUES)),
+    ("1.0", "SPIN", None, "spin", SPIN_VALUES, elements(SPIN_NAMES, SPIN_VALUES)),
     (
         "1.0",
         "SPIN/NUTATION",
         None,
         "spinNutation",
         (*SPIN_VALUES, 5.0, 6.0, 7.0),
-        flat(f"{SPIN_NAMES} NUTATION NUTATION_PER NUTATION_PHASE", (*SPIN_VALUES, 5.0, 6.0, 7.0)),
+        elements(
+            f"{SPIN_NAMES} NUTATION NUTATION_PER NUTATION_PHASE", (*SPIN_VALUES, 5.0, 6.0, 7.0)
+        ),
     ),
-    ("2.0", "EULER_ANGLE", "ZXZ", "eulerAngle", ANGLES, flat("ANGLE_1 ANGLE_2 ANGLE_3", ANGLES)),
+    (
+        "2.0",
+        "EULER_ANGLE",
+        "ZXZ",
+        "eulerAngle",
+        ANGLES,
+        elements("ANGLE_1 ANGLE_2 ANGLE_3", ANGLES),
+    ),
     (
         "2.0",
         "EULER_ANGLE/DERIVATIVE",
         "XYZ",
         "eulerAngleDerivative",
         (*ANGLES, 1.0, 2.0, 3.0),
-        flat(
+        elements(
             "ANGLE_1 ANGLE_2 ANGLE_3 ANGLE_1_DOT ANGLE_2_DOT ANGLE_3_DOT", (*ANGLES, 1.0, 2.0, 3.0)
         ),
     ),
@@ -285,7 +294,7 @@ XML_CASES = [
         None,
         "spinNutationMom",
         (*SPIN_VALUES, 5.0, 6.0, 7.0),
-        flat(
+        elements(
             f"{SPIN_NAMES} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL",
             (*SPIN_VALUES, 5.0, 6.0, 7.0),
         ),
@@ -318,7 +327,7 @@ def test_xml_whose_angles_are_not_those_of_the_sequence_is_refused(tmp_path):
     text = kvn(
         rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", "321", ATTITUDE_TYPE="EULER_ANGLE")
     )
-    angles = f"<rotationAngles>{turns('angle', 'XYZ')}</rotationAngles>"
+    angles = f"<rotationAngles>{angle_elements('angle', 'XYZ')}</rotationAngles>"
     state = f"<eulerAngle><EPOCH>{EPOCHS[0]}</EPOCH>{angles}</eulerAngle>"
     assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in aem_refusal(
         tmp_path, xml_of("1.0", text, state)

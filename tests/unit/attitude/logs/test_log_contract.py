@@ -56,7 +56,7 @@ def whole_samples(path, form: LogFile) -> list[AttitudeSample]:
     return samples
 
 
-def same(one: AttitudeSample, other: AttitudeSample) -> bool:
+def is_same_sample(one: AttitudeSample, other: AttitudeSample) -> bool:
     off = one.q_icrs_to_cam - other.q_icrs_to_cam
     return one.t_ns == other.t_ns and np.abs(off).max() < 1e-12
 
@@ -81,7 +81,7 @@ def test_a_whole_file_is_read_and_what_is_read_of_it_is_written_in_every_form(tm
         write_log(tmp_path / f"again{ending}", samples)
         again = read_log(tmp_path / f"again{ending}")
         assert len(again) == len(samples)
-        assert all(map(same, again, samples))
+        assert all(map(is_same_sample, again, samples))
 
 
 def assert_cuts_are_read(path, form: LogFile, trials: int) -> None:
@@ -93,7 +93,7 @@ def assert_cuts_are_read(path, form: LogFile, trials: int) -> None:
         path.write_bytes(data[:size])
         found = read_or_refused(path, form)
         assert found is None or len(found) <= len(samples), size
-        assert found is None or all(map(same, found, samples[: len(found)])), size
+        assert found is None or all(map(is_same_sample, found, samples[: len(found)])), size
 
 
 @each_fast_form
@@ -117,7 +117,7 @@ def spoil(path, form: LogFile, trials: int) -> None:
         if found is not None and form.own_times:
             assert sum(sample.t_ns not in times for sample in found) <= count
         if found is not None and form.checked:
-            assert all(map(same, found, samples[: len(found)]))
+            assert all(map(is_same_sample, found, samples[: len(found)]))
 
 
 @each_fast_form
@@ -152,7 +152,7 @@ def renamed(path, form: LogFile, endings: list[str]) -> None:
         path = path.rename(path.with_name(f"log{ending}"))
         assert format_of(path).name == form.format_name
         found = whole_samples(path, form)
-        assert len(found) == len(samples) and all(map(same, found, samples))
+        assert len(found) == len(samples) and all(map(is_same_sample, found, samples))
 
 
 @each_fast_form
@@ -177,7 +177,7 @@ def test_a_text_may_begin_with_a_byte_order_mark_and_end_its_lines_as_windows_do
     samples = whole_samples(path, form)
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
     found = whole_samples(path, form)
-    assert len(found) == len(samples) and all(map(same, found, samples))
+    assert len(found) == len(samples) and all(map(is_same_sample, found, samples))
 
 
 @pytest.mark.parametrize("ending", WRITERS)
@@ -190,7 +190,7 @@ def test_attitudes_that_go_back_in_time_are_refused_or_put_in_order(tmp_path, en
             assert line_of(error).startswith(str(path))
             continue
         found = read_or_refused(path, FORMS["CSV"])
-        assert found is None or all(map(same, found, SAMPLES))
+        assert found is None or all(map(is_same_sample, found, SAMPLES))
 
 
 @pytest.mark.parametrize("ending", WRITERS)

@@ -69,7 +69,7 @@ def as_aem_holds(samples):
     return kept
 
 
-def assert_same(read, expected, rate_tolerance):
+def assert_same_samples(read, expected, rate_tolerance):
     assert [s.t_ns for s in read] == [s.t_ns for s in expected]
     assert [s.sequence for s in read] == [s.sequence for s in expected]
     assert [s.discontinuity for s in read] == [s.discontinuity for s in expected]
@@ -101,7 +101,9 @@ def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(
     write_log(tmp_path / f"b.{second}", read_log(tmp_path / f"a.{first}"))
     aem = {first, second} & AEM_FORMS
     expected = as_aem_holds(samples) if aem else samples
-    assert_same(read_log(tmp_path / f"b.{second}"), expected, 2 * RATE_TOLERANCE if aem else 0.0)
+    assert_same_samples(
+        read_log(tmp_path / f"b.{second}"), expected, 2 * RATE_TOLERANCE if aem else 0.0
+    )
 
 
 @pytest.mark.parametrize(("one", "other"), [("jsonl", "json"), ("kvn", "aem")])

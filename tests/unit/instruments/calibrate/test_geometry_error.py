@@ -82,13 +82,15 @@ def dots_of(file, seen, seed, noise_px, dot_noise_px=0.0):
     return problem, data
 
 
-def error_of(file, seen, names, seed, noise_px, dot_noise_px=0.0):
+def lens_error(file, seen, names, seed, noise_px, dot_noise_px=0.0):
     """The rms error of a lens with such parameters over the tracker's field, in its stated
     error.
     """
     problem, data = dots_of(file, seen, seed, noise_px, dot_noise_px)
     found = fit(problem, Model(names), 0, data)
-    return off_arcsec(found.geometry, seen) / uncertainty_of(problem, found, data).rms_arcsec
+    return (
+        field_error_arcsec(found.geometry, seen) / uncertainty_of(problem, found, data).rms_arcsec
+    )
 
 
 @pytest.mark.parametrize(("names", "degree"), [(PINHOLE, 0), (BROWN_CONRADY, 3)])
@@ -116,7 +118,7 @@ def test_a_model_is_compared_in_few_steps_by_the_error_of_many(
     assert count < 0.75 * (len(steps) - count)
 
 
-def off_arcsec(geometry, seen):
+def field_error_arcsec(geometry, seen):
     """The rms error of directions over the tracker's field."""
     sides = (np.linspace(0, size - 1, GRID) for size in seen.tracker.resolution_px)
     u, v = (part.ravel() for part in np.meshgrid(*sides))
@@ -133,14 +135,14 @@ def test_a_lens_that_noise_hides_is_in_the_error_of_a_pinhole(tmp_path):
     error.
     """
     file, seen = tilted_screen(tmp_path, tilt_deg=2.5)
-    off = [error_of(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
+    off = [lens_error(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
 
 
 def test_dots_with_errors_of_their_own_are_not_averaged_over_frames(tmp_path):
     file, seen = tilted_screen(tmp_path, tilt_deg=3.0)
     off = [
-        error_of(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02)
+        lens_error(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02)
         for seed in range(SEEDS)
     ]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS

@@ -72,7 +72,7 @@ def power_law_bench(folder, detector, collimator_mm=120, black=BLACK):
     (folder / "truth.toml").write_text(bench_text(TWIN, true))
 
 
-def measured(folder, seed, sets_exposure=True, black=BLACK):
+def measured_light(folder, seed, sets_exposure=True, black=BLACK):
     """What the step comes to on the planted bench, and its figures in sigmas: the response by
     decades, and black.
     """
@@ -105,7 +105,7 @@ def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detec
     power_law_bench(tmp_path, detector)
     off, black = [], []
     for seed in range(4):
-        _, response, level = measured(tmp_path, seed)
+        _, response, level = measured_light(tmp_path, seed)
         off.append(response)
         black.append(level)
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS
@@ -132,7 +132,7 @@ def test_the_glow_of_a_screen_that_is_darker_at_its_edges_is_counted_by_its_ligh
     tables = {"monitor": {"bits": BITS, "calibration": "known.toml"}, "tracker.detector": NOISY}
     tables["collimator"] = {"focal_length_mm": 120}
     bench.write_text(bench_text(TWIN, tables))
-    _, off, black = measured(tmp_path, 0, black=BRIGHT_BLACK)
+    _, off, black = measured_light(tmp_path, 0, black=BRIGHT_BLACK)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     error = read_toml(tmp_path / "response.toml").errors.black
@@ -156,7 +156,7 @@ def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tm
     were read as 0 or 1 DN.
     """
     power_law_bench(tmp_path, SILENT, collimator_mm=30)
-    outcome, off, black = measured(tmp_path, 0)
+    outcome, off, black = measured_light(tmp_path, 0)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     assert float(outcome.figures["error_at_1e-3_percent"]) < 1.0
@@ -165,7 +165,7 @@ def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tm
 
 def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_errors(tmp_path):
     power_law_bench(tmp_path, SILENT, collimator_mm=30)
-    outcome, off, black = measured(tmp_path, 0, sets_exposure=False)
+    outcome, off, black = measured_light(tmp_path, 0, sets_exposure=False)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     # Half a step of the ADC, of codes whose peak is a few steps.
@@ -174,7 +174,7 @@ def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_
 
 def test_the_command_and_the_step_give_the_same_figures(tmp_path):
     power_law_bench(tmp_path, NOISY)
-    outcome, _, _ = measured(tmp_path, 0)
+    outcome, _, _ = measured_light(tmp_path, 0)
     found = calibrate_photometric(tmp_path / "measured.csv", tmp_path / "again.toml", bits=BITS)
     mine, its = (read_toml(tmp_path / name).errors for name in ("response.toml", "again.toml"))
     assert mine == its

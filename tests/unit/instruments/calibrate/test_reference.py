@@ -99,7 +99,7 @@ def fitted_reference(folder: Path, text: str) -> Any:
     return fit_reference(path, read_readings(path, None))
 
 
-def off_arcsec(found: FloatArray, true: FloatArray) -> FloatArray:
+def axis_errors_arcsec(found: FloatArray, true: FloatArray) -> FloatArray:
     """The error of a rotation about mon's axes (3,)."""
     return np.asarray(ARCSEC_PER_RAD * to_rotation_vector(multiply(conjugate(true), found)))
 
@@ -110,7 +110,7 @@ def test_a_rotation_is_found_exactly_without_noise(
 ) -> None:
     text, true = planted_cube_readings(rng, 0.0, stations)
     found = fitted_reference(tmp_path, text)
-    assert np.abs(off_arcsec(found.q_mon_to_reference, true)).max() < EXACT_ARCSEC
+    assert np.abs(axis_errors_arcsec(found.q_mon_to_reference, true)).max() < EXACT_ARCSEC
 
 
 @pytest.mark.parametrize("sigma", [False, True])
@@ -125,7 +125,7 @@ def test_the_intervals_of_1000_benches_hold(
         text, true = planted_cube_readings(rng, stations=True, sigma=sigma)
         found = fitted_reference(tmp_path, text)
         k = 1.96 if found.dof is None else float(stats.t.ppf(0.975, found.dof))
-        off = np.abs(off_arcsec(found.q_mon_to_reference, true))
+        off = np.abs(axis_errors_arcsec(found.q_mon_to_reference, true))
         held += off <= k * np.array(found.sigma_arcsec)
         small.append(max(found.sigma_arcsec[:2]))
     assert (held >= MIN_HELD).all() and (held <= MAX_HELD).all()
@@ -194,7 +194,7 @@ def test_the_command_prints_a_table_that_a_bench_file_takes(
     after.write_text(f"{bench_text()}\n{table}")
     file = read_bench_file(after)
     assert file.config.alignment is not None and file.config.alignment.name == "cube 7"
-    off = off_arcsec(np.array(file.config.alignment.q_mon_to_reference), true)
+    off = axis_errors_arcsec(np.array(file.config.alignment.q_mon_to_reference), true)
     assert np.abs(off).max() < 5 * max(fitted_reference(tmp_path, text).sigma_arcsec)
     # what is said of a bench changes no frame
     assert file.sha256 == read_bench_file(before).sha256

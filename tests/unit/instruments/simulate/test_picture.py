@@ -33,7 +33,7 @@ def picture_of(dn):
     return exposure_picture(dn, FULL)
 
 
-def disc(row, column, radius, size=200):
+def disc_pixels(row, column, radius, size=200):
     rows, columns = np.mgrid[:size, :size]
     return np.hypot(rows - row, columns - column) <= radius
 
@@ -63,7 +63,7 @@ def test_a_curved_sky_is_no_star(rng):
 @pytest.mark.parametrize("radius_px", [12, 30, 70])
 def test_a_body_has_its_own_size(rng, radius_px):
     """The Moon saturates: discs about its plateau made it a lump, wider by up to 16 px."""
-    shape = disc(100, 100, radius_px)
+    shape = disc_pixels(100, 100, radius_px)
     picture = picture_of(noisy_frame(rng, [(10, 10, 1500)], body_dn=5000.0 * shape))
     assert np.array_equal(picture[:, 30:] == 255, shape[:, 30:])
     assert picture[10, 10] > SEEN  # and a star beside it is seen
@@ -76,7 +76,7 @@ def test_a_body_over_the_frame_is_white(rng):
 
 def test_a_trail_has_no_discs(rng):
     """A star of 40 px of smear is seen as long as it is."""
-    trail_dn = 400.0 * (disc(100, 100, 40) & (np.abs(np.mgrid[:200, :200][0] - 100) <= 1))
+    trail_dn = 400.0 * (disc_pixels(100, 100, 40) & (np.abs(np.mgrid[:200, :200][0] - 100) <= 1))
     picture = picture_of(noisy_frame(rng, body_dn=trail_dn))
     lit_rows = np.flatnonzero((picture > 100).any(axis=1))
     assert 99 <= lit_rows.min() <= lit_rows.max() <= 101

@@ -47,7 +47,7 @@ VEGA_ALONE = {
 SCAN_OUT_TOLERANCE_PX = 0.03  # of 0.4 px that a screen's scan-out is worth
 
 
-def star(x, y, z=CAMERA.focal_length_px):
+def star_on_pixel(x, y, z=CAMERA.focal_length_px):
     """A star of one electron per second at a pixel when the middle row is in the middle of its
     exposure.
     """
@@ -69,7 +69,7 @@ def rolling_image(stars, rate, direction=1):
 )
 def test_each_row_has_its_own_exposure(rate_deg_s, direction):
     """Row by row the mean of instants of that row's own time: light, and places along both axes."""
-    rate, stars = np.radians(np.array(rate_deg_s)), star(60.3, 30.6)
+    rate, stars = np.radians(np.array(rate_deg_s)), star_on_pixel(60.3, 30.6)
     exact, at = np.zeros(SIZE[::-1]), Motion(IDENTITY, rate, EXPOSURE_S)
     for row in range(10, 100):
         late_s = direction * (row - (SIZE[1] - 1) / 2) * ROW_S
@@ -99,7 +99,7 @@ def test_a_star_that_runs_with_the_rows_is_exposed_for_longer():
     # On the axis across the turn a star moves at f times the rate, but for 1 + tan^2.
     speed = np.sign(drawn_y(1e-3) - 59.5) * rate[0] * CAMERA.focal_length_px
     for y_px in (30.0, 59.5, 90.0):
-        image, share = rolling_image(star(79.5, y_px), rate), speed * ROW_S
+        image, share = rolling_image(star_on_pixel(79.5, y_px), rate), speed * ROW_S
         assert image.sum() == pytest.approx(1 / (1 - share), rel=1e-4 + MAX_CUT)
         centre = (image.sum(axis=1) @ np.arange(SIZE[1])) / image.sum()
         assert centre - 59.5 == pytest.approx((y_px - 59.5) / (1 - share), abs=3e-3)
@@ -110,7 +110,7 @@ def drawn_y(seconds):
     turned = CAMERA.cam_to_image @ to_matrix(
         propagate(IDENTITY, np.radians(np.array([2.0, 0, 0])), seconds)
     )
-    return CAMERA.project(star(79.5, 59.5).vectors @ turned.T)[1][0]
+    return CAMERA.project(star_on_pixel(79.5, 59.5).vectors @ turned.T)[1][0]
 
 
 def test_a_rolling_truth_is_where_the_light_is_and_a_still_one_is_global_bit_for_bit(tmp_path):

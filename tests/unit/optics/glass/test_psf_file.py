@@ -92,7 +92,7 @@ def spoilt(**changes):
     )
 
 
-def put(place, value):
+def put_value(place, value):
     def change(array):
         array[place] = value
         return array
@@ -107,14 +107,14 @@ def put(place, value):
             lambda s: replace(s, images=s.images[:, :-1]),
             "write images (n, height, width) of odd sides",
         ),
-        (spoilt(images=put((2, 0, 0), np.nan)), "image 3 has samples that are not finite"),
-        (spoilt(images=put(1, 0.0)), "image 2 has samples that are not finite, or no light"),
+        (spoilt(images=put_value((2, 0, 0), np.nan)), "image 3 has samples that are not finite"),
+        (spoilt(images=put_value(1, 0.0)), "image 2 has samples that are not finite, or no light"),
         (lambda s: replace(s, at=s.at[:-1]), "write one point for each image"),
-        (spoilt(at=put((0, 2), 999.0)), "give each point one image of each wavelength"),
+        (spoilt(at=put_value((0, 2), 999.0)), "give each point one image of each wavelength"),
         (spoilt(images=lambda i: np.roll(i, 26, axis=2)), "put the chief ray there"),
         (spoilt(images=lambda i: i - 0.3 * i.mean()), "subtract its background"),
-        (spoilt(facts=put((0, 0), 3.0)), "relative_illumination is not within 0 to 2"),
-        (spoilt(facts=put((0, 1), 1.0)), "outside_share is not within 0 to 1"),
+        (spoilt(facts=put_value((0, 0), 3.0)), "relative_illumination is not within 0 to 2"),
+        (spoilt(facts=put_value((0, 1), 1.0)), "outside_share is not within 0 to 1"),
         (spoilt(at=lambda at: at * [1, 1, -1, 1]), "write wavelengths over 0 nm"),
         (lambda s: replace(s, per_px=0), "0 samples a pixel; write 1 or more"),
     ],

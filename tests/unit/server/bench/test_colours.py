@@ -62,7 +62,7 @@ def bench_path(folder, *changes, channels="rgb", panel="oled"):
     return path
 
 
-def centroids(frame, bench, places):
+def subpixel_errors(frame, bench, places):
     """How far stars that stand alone are from their places (n, 2), by sub-pixels of sRGB's
     formula at `places`.
     """
@@ -94,14 +94,15 @@ def test_all_light_of_a_star_has_one_centroid_whatever_its_colour(tmp_path, layo
     change = {"monitor": {"bits": 16}, "monitor.primaries": {"layout": layout}}
     with load(bench_path(tmp_path, change, channels=channels)) as bench:
         frame = bench.frame(ORION_Q)
-        off = centroids(frame, bench, STRIPES[layout])
+        off = subpixel_errors(frame, bench, STRIPES[layout])
         assert frame.codes.shape == (240, 320, 3) and len(off) > 10
         holds("one-centroid", np.abs(off).max())
     with load(
         bench_path(tmp_path, change, {"monitor.primaries": {"layout": "white"}}, channels=channels)
     ) as bench:
         assert (
-            np.abs(centroids(bench.frame(ORION_Q), bench, STRIPES[layout])).max() > UNCORRECTED_PX
+            np.abs(subpixel_errors(bench.frame(ORION_Q), bench, STRIPES[layout])).max()
+            > UNCORRECTED_PX
         )
 
 
@@ -115,7 +116,7 @@ def test_a_turned_screen_has_its_stripes_turned(tmp_path):
         bench_path(tmp_path, {"monitor": keys, "monitor.primaries": {"layout": "rgb-stripe"}})
     ) as bench:
         found = bench.colours.places_px
-        off = centroids(bench.frame(ORION_Q), bench, found)
+        off = subpixel_errors(bench.frame(ORION_Q), bench, found)
     assert np.abs(off).max() < CENTROID_PX
     # (-1, 0) is flipped, then turned
     np.testing.assert_allclose(found, [(0, -THIRD), (0, 0), (0, THIRD)], atol=1e-12)

@@ -17,7 +17,7 @@ def line(text: str) -> str:
     return re.sub(rf"(?m)^{key} = .*$", text, SMALL_BENCH, count=1)
 
 
-def put(old: str, new: str) -> str:
+def other_text(old: str, new: str) -> str:
     assert old in SMALL_BENCH
     return SMALL_BENCH.replace(old, new)
 
@@ -40,7 +40,7 @@ NEEDED = (
 REFUSED = [
     *((without(key), f"[tracker] the key {key} is missing") for key in NEEDED),
     (
-        put("aperture_mm = 30", "aperture = 30"),
+        other_text("aperture_mm = 30", "aperture = 30"),
         "[tracker] unknown key aperture; did you mean aperture_mm?",
     ),
     (line("aperture_mm = -30"), "[tracker] aperture_mm = -30; number >= 1e-06 is wanted"),
@@ -52,20 +52,20 @@ REFUSED = [
     (line("aperture_mm = true"), "[tracker] aperture_mm = true; number is wanted"),
     (line("aperture_mm = nan"), "tracker.aperture_mm = nan; a finite number is wanted"),
     (
-        put("[320, 240]", "[320]"),
+        other_text("[320, 240]", "[320]"),
         "[monitor] resolution_px = [320]; array of length 2 is wanted",
     ),
     (
-        put("[320, 240]", "[320, 240.5]"),
+        other_text("[320, 240]", "[320, 240.5]"),
         "[monitor] resolution_px = [320,240.5]; whole number is wanted",
     ),
     (
-        put("[320, 240]", "[320, inf]"),
+        other_text("[320, 240]", "[320, inf]"),
         "monitor.resolution_px = inf; a finite number is wanted",
     ),
-    (put("[collimator]", "[colimator]"), "unknown key colimator; did you mean collimator?"),
-    (put("[tracker]", "x = 1\n[tracker]"), "unknown key x; known are tracker, monitor"),
-    (put("[tracker]", "[tracker"), "not TOML"),
+    (other_text("[collimator]", "[colimator]"), "unknown key colimator; did you mean collimator?"),
+    (other_text("[tracker]", "x = 1\n[tracker]"), "unknown key x; known are tracker, monitor"),
+    (other_text("[tracker]", "[tracker"), "not TOML"),
     (more("q_cam_to_mon = [1,1,0,0]"), "q_cam_to_mon: its norm is 1.41421"),
     (
         more('[sky]\ntemperature = "hot"'),

@@ -55,11 +55,11 @@ def test_where_several_transforms_move_they_are_interpolated_as_tf2_does(bag):
     sent = [
         *(
             ("/tf", ros_bags.TF, t, MAKE.tf(MAKE.transform_stamped(t, "map", "odom", wxyz(turn))))
-            for t, turn in at(slow, 300)
+            for t, turn in turns_in_time(slow, 300)
         ),
         *(
             ("/tf", ros_bags.TF, t, MAKE.tf(MAKE.transform_stamped(t, "odom", "base", wxyz(turn))))
-            for t, turn in at(fast, 100)
+            for t, turn in turns_in_time(fast, 100)
         ),
     ]
     log = open_log(bag(sent), Stated(reference="icrs", body="base"))
@@ -73,7 +73,7 @@ def test_where_several_transforms_move_they_are_interpolated_as_tf2_does(bag):
     ]
 
 
-def at(turns, step_ms):
+def turns_in_time(turns, step_ms):
     return [(START_NS + k * step_ms * 10**6, turn) for k, turn in enumerate(turns)]
 
 
@@ -85,7 +85,7 @@ def test_the_first_tfs_type_is_read(tmp_path):
     types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
     with Writer(tmp_path / "a.bag") as writer:
         topic = writer.add_connection("/tf", kind, typestore=types)
-        for t_ns, turn in at(rotations(3), 100):
+        for t_ns, turn in turns_in_time(rotations(3), 100):
             message = make.tf(make.transform_stamped(t_ns, "/icrs", "/cam", wxyz(turn)))
             writer.write(
                 topic,

@@ -16,7 +16,7 @@ def blank(name, **keys):
     return fault_of({"kind": "blank", "name": name, **keys})
 
 
-def star(name, **keys):
+def false_star(name, **keys):
     return fault_of(
         {"kind": "false-star", "name": name, "tracker_px": [5, 5], "electrons": 100, **keys}
     )
@@ -54,7 +54,7 @@ def test_a_fault_of_the_file_is_on_at_its_time_for_its_time():
 
 
 def test_light_between_two_frames_is_divided_among_them_in_proportion():
-    schedule, _ = schedule_of(star("flash", at_s=0.014, for_s=0.02))
+    schedule, _ = schedule_of(false_star("flash", at_s=0.014, for_s=0.02))
     on = faults_by_frame(schedule, 5)
     assert on == [[], [("flash", 0.6)], [("flash", 1.0)], [("flash", 0.4)], []]
     assert sum(share for row in on for _, share in row) * FRAME_NS == 0.02e9
@@ -75,7 +75,7 @@ def test_the_first_frame_is_the_zero_unless_it_is_said():
 
 
 def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
-    schedule, heard = schedule_of(blank("cover"), star("ghost"))
+    schedule, heard = schedule_of(blank("cover"), false_star("ghost"))
     assert schedule.names() == ["cover", "ghost"]
     assert faults_by_frame(schedule, 2) == [[], []]
     schedule.start("ghost", "console")
@@ -106,7 +106,7 @@ def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
 def test_the_stream_asks_for_faults_of_its_own_now_or_later():
     schedule, _ = schedule_of()
     schedule.at(0)
-    schedule.ask(star("now", for_s=0.02), "stream")
+    schedule.ask(false_star("now", for_s=0.02), "stream")
     schedule.ask(blank("later", at_s=0.04, for_s=0.01), "stream")
     # a time that has passed means now
     schedule.ask(blank("past", at_s=0.001, for_s=0.01), "stream")

@@ -115,7 +115,7 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
         memory_mb = points("hours", "memory_mb")[1]
         hours.set(
             title=f"report, in {min(memory_mb):.0f} to {max(memory_mb):.0f} MB",
-            xlabel="hours of the run, 60 frames and packets a second",
+            xlabel="hours, at 60 frames and packets a second",
             ylabel="processor time [s]",
         )
         for axes in (stars, pixels, workers, hours):

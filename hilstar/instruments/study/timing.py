@@ -64,9 +64,18 @@ STRIPE_NOTE = (
     f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each,"
     " the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
 )
+WHOLE_PT = 5.0  # width of the lines of whole refreshes: another line lies on them
+
+
+def is_whole(point: "StripePoint") -> bool:
+    """Whether a row's exposure is of whole refreshes."""
+    return float(point.refreshes).is_integer()
+
+
 STRIPE_PANEL = PanelSpec(
     (
-        LineSpec("row", "foretold"),
+        LineSpec("row", "foretold", where=is_whole, look={"lw": WHOLE_PT}),
+        LineSpec("row", "foretold", where=lambda point: not is_whole(point)),
         LineSpec("row", "light", "", marker="o", named=False, look={"ms": 3}),
     ),
     "light / mean light",
@@ -201,7 +210,7 @@ def stripe_depth(points: list[StripePoint], whole: bool) -> float:
     """
     depth = 0.0
     for point in points:
-        if float(point.refreshes).is_integer() == whole:
+        if is_whole(point) == whole:
             depth = max(depth, abs(point.light - 1))
     return depth
 

@@ -78,12 +78,17 @@ class PixelGaussians:
         nodes: int = NODES,
     ) -> None:
         xx, yy, xy = bounded(covariance).T
-        self._xx, self._yy, self._xy = (part[:, None, None] for part in (xx, yy, xy))
+        self._xx, self._yy, self._xy = xx[:, None, None], yy[:, None, None], xy[:, None, None]
         determinant = xx * yy - xy**2
         self._determinant = determinant[:, None, None]
-        rules = [cell_quadrature(float(side), nodes) for side in np.round(side_px, 3)]
-        at = np.stack([rule[0] for rule in rules])
-        self._weight = np.stack([rule[1] for rule in rules])
+        places = []
+        weights = []
+        for side in np.round(side_px, 3):
+            rule_places, rule_weights = cell_quadrature(float(side), nodes)
+            places.append(rule_places)
+            weights.append(rule_weights)
+        at = np.stack(places)
+        self._weight = np.stack(weights)
         self._nodes = nodes
         self._x = x_px[:, :, None] + at[:, None]
         self._y = y_px[:, :, None] + at[:, None]
@@ -116,7 +121,9 @@ class PixelGaussians:
         yy = self._yy
         xy = self._xy
         determinant = self._determinant
-        first = [share, (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant]
+        by_x = (yy * x - xy * y) / determinant
+        by_y = (xx * y - xy * x) / determinant
+        first = [share, by_x, by_y]
         if not shape:
             return first
         x2 = self._moment(self._over_x(2), 0)
@@ -161,7 +168,8 @@ def normal_equations(
     """
     weighted = columns * weight[:, None]
     normal = weighted @ columns.transpose(0, 2, 1)
-    return normal, np.asarray((weighted @ values[:, :, None])[:, :, 0])
+    right = (weighted @ values[:, :, None])[:, :, 0]
+    return normal, np.asarray(right)
 
 
 def amplitudes(columns: Sequence[FloatArray], weight: FloatArray, images: FloatArray) -> FloatArray:
@@ -170,9 +178,10 @@ def amplitudes(columns: Sequence[FloatArray], weight: FloatArray, images: FloatA
     flat = np.stack(columns, axis=1).reshape(count, len(columns), -1)
     normal, right = normal_equations(flat, weight.reshape(count, -1), images.reshape(count, -1))
     size = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), SMALLEST))
-    unit = normal / size[:, :, None] / size[:, None, :] + RIDGE * np.eye(len(columns))
-    solved = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0]
-    return np.asarray(solved / size)
+    unit = normal / size[:, :, None] / size[:, None, :]
+    ridge = RIDGE * np.eye(len(columns))
+    solution = np.linalg.solve(unit + ridge, (right / size)[:, :, None])[:, :, 0]
+    return np.asarray(solution / size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +201,11 @@ class PointImages:
 
     def offsets(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels' places less the points' (n,), along x and y (n, s)."""
-        reach = np.arange(self.images.shape[1]) - self.images.shape[1] // 2
-        return (self.column - x_px)[:, None] + reach, (self.row - y_px)[:, None] + reach
+        side = self.images.shape[1]
+        reach = np.arange(side) - side // 2
+        across = (self.column - x_px)[:, None] + reach
+        down = (self.row - y_px)[:, None] + reach
+        return across, down
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +235,9 @@ def fit_each(
         slopes = gaussians.slopes(shape=True)
         if points.has_level:
             slopes.append(np.ones_like(slopes[0]))
-        solved = amplitudes(slopes, points.weight, points.images)
-        steps = solved[:, 1:6] / np.maximum(np.abs(solved[:, :1]), SMALLEST)
+        solution = amplitudes(slopes, points.weight, points.images)
+        flux = np.maximum(np.abs(solution[:, :1]), SMALLEST)
+        steps = solution[:, 1:6] / flux
         moves = np.clip(steps[:, :2], -MAX_STEP_PX, MAX_STEP_PX)
         growth = steps[:, 2:]
         if alike:
@@ -249,8 +262,8 @@ def over_field(terms: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     weight = np.ones((len(terms), 1))
     for _ in range(FIELD_ROUNDS):
-        solved = np.linalg.lstsq(terms * weight, covariance * weight, rcond=None)[0]
-        off = np.abs(covariance - terms @ solved).max(axis=1, keepdims=True)
+        solution, *_ = np.linalg.lstsq(terms * weight, covariance * weight, rcond=None)
+        off = np.abs(covariance - terms @ solution).max(axis=1, keepdims=True)
         usual = max(OUTLIER_MEDIANS * float(np.median(off)), RIDGE)
         weight = 1 / np.maximum(1.0, off / usual)
-    return np.asarray(solved, dtype=np.float64)
+    return np.asarray(solution, dtype=np.float64)

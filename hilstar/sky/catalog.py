@@ -114,7 +114,8 @@ class Catalog:
 
     def taken(self, rows: IntArray | npt.NDArray[np.bool_]) -> "Catalog":
         """The stars at `rows`: places, or a mask (n,)."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in column_names()})
+        columns = {name: getattr(self, name)[rows] for name in column_names()}
+        return replace(self, **columns)
 
     def at_phase(self, jd: float) -> "Catalog":
         """The stars with their V at a Julian date: a sinusoid of magnitudes about V, of those
@@ -124,9 +125,8 @@ class Catalog:
         turns = (jd - self.maximum_jd[known]) / self.period_d[known]
         v_mag = self.v_mag.copy()
         v_mag[known] -= self.range_mag[known] / 2 * np.cos(2 * np.pi * turns)
-        count = int(
-            np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES]).sum()
-        ) - len(known)
+        is_variable = np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES])
+        count = int(is_variable.sum()) - len(known)
         note = (
             f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch"
             " of phase have their mean"
@@ -161,19 +161,19 @@ class Catalog:
         if not all(n.isascii() and n.isdigit() and len(n) <= MAX_DIGITS for n in numbers):
             return None
         if self.designation == TYCHO:
-            if len(numbers) == 3:
-                return int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2])
+            if len(numbers) != 3:
+                return None
+            region, number, component = map(int, numbers)
+            return region * TYC_REGION + number * 10 + component
+        if len(numbers) != 1:
             return None
-        return int(numbers[0]) if len(numbers) == 1 else None
+        return int(numbers[0])
 
 
 def column_names() -> list[str]:
     """The names of a catalogue's arrays."""
-    return [
-        field.name
-        for field in fields(Catalog)
-        if field.name not in ("designation", "rows_read", "notes")
-    ]
+    facts_of_all = ("designation", "rows_read", "notes")
+    return [field.name for field in fields(Catalog) if field.name not in facts_of_all]
 
 
 def plain_catalog(
@@ -221,10 +221,10 @@ def _packaged(faintest_v_mag: float) -> Catalog:
     open several benches.
     """
     with np.load(PACKAGED_CATALOG) as packed:
-        bright = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
-        catalog = unpack(
-            {name: packed[name][bright] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"])
-        )
+        v_mag = packed["v_mag"] / FIELDS["v_mag"][1]
+        bright = np.flatnonzero(v_mag <= faintest_v_mag)
+        columns = {name: packed[name][bright] for name in (*FIELDS, *LETTERS)}
+        catalog = unpack(columns, int(packed["rows_read"]))
     for name in column_names():
         getattr(catalog, name).setflags(write=False)
     return catalog
@@ -239,9 +239,8 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
     rows_read = 0
     try:
         with open_lines(path, "give the CDS I/239 hip_main.dat", MAX_CATALOGUE_BYTES) as lines:
-            for line_number, row in enumerate(
-                csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE), start=1
-            ):
+            rows_of_fields = csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE)
+            for line_number, row in enumerate(rows_of_fields, start=1):
                 if not row:
                     continue
                 rows_read += 1
@@ -255,10 +254,14 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
             f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat"
         )
     table = np.array(rows, dtype=np.int64)
-    return {name: table[:, i] for i, name in enumerate((*FIELDS, *LETTERS))}, rows_read
+    names = (*FIELDS, *LETTERS)
+    return dict(zip(names, table.T, strict=True)), rows_read
 
 
 def _parse_row(row: list[str], where: str) -> list[int] | None:
+    """The steps of a row's fields and its letters; None for a star without what is REQUIRED.
+    Raises InputError.
+    """
     if len(row) != COLUMN_COUNT or row[0] != "H":
         raise InputError(
             f"{where}: not a row of hip_main.dat ({COLUMN_COUNT} fields after 'H|'); give the CDS"
@@ -303,23 +306,22 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
         values[name] = steps / per_unit
         values[name][steps == np.iinfo(steps.dtype).min] = np.nan
     letters = {name: columns[name].astype(np.uint8).view("S1") for name in LETTERS}
-    varies = np.isin(letters["variable"], [bytes([letter]) for letter in VARIABLE_TYPES])
+    variable = letters["variable"]
+    varies = np.isin(variable, [bytes([letter]) for letter in VARIABLE_TYPES])
     hip = columns["hip"].astype(np.int32)
     range_mag = values.pop("hp_faintest_mag") - values.pop("hp_brightest_mag")
-    return plain_catalog(
-        "HIP",
-        rows_read,
-        values
-        | {
-            "hip": hip,
-            "identifier": hip.astype(np.int64),
-            "variable": np.where(varies, letters["variable"], b""),
-            "range_mag": np.where(varies, range_mag, np.nan).astype(np.float32),
-            "period_d": np.where(varies, values["period_d"], np.nan).astype(np.float32),
-            "multiple": letters["multiple"],
-            "separation_arcsec": values["separation_arcsec"].astype(np.float32),
-        },
-    )
+    range_mag = np.where(varies, range_mag, np.nan)
+    period_d = np.where(varies, values["period_d"], np.nan)
+    plain: dict[str, npt.NDArray[Any]] = {
+        "hip": hip,
+        "identifier": hip.astype(np.int64),
+        "variable": np.where(varies, variable, b""),
+        "range_mag": range_mag.astype(np.float32),
+        "period_d": period_d.astype(np.float32),
+        "multiple": letters["multiple"],
+        "separation_arcsec": values["separation_arcsec"].astype(np.float32),
+    }
+    return plain_catalog("HIP", rows_read, values | plain)
 
 
 class StarName(NamedTuple):
@@ -344,4 +346,5 @@ def label_of(hip: int) -> str:
     any.
     """
     designation, name = star_names().get(hip, ("", ""))
-    return designation or name or (f"HIP {hip}" if hip else "")
+    number = f"HIP {hip}" if hip else ""
+    return designation or name or number

@@ -206,12 +206,11 @@ class _Columns:
     @property
     def is_gaia(self) -> bool:
         """Whether the table has the names of Gaia's archive, which say the units."""
-        return (
-            all(name in self.layout.role for name in ("gaia", "g_mag"))
-            and self.pair[0].lower() == "ra"
-        )
+        has_names = all(name in self.layout.role for name in ("gaia", "g_mag"))
+        return has_names and self.pair[0].lower() == "ra"
 
     def has_unit(self, column: str) -> bool:
+        """Whether the table states a column's unit."""
         return bool((self.table.unit.get(column) or "").strip())
 
     def _in_unit(self, role: str, column: str) -> FloatArray:
@@ -253,7 +252,8 @@ class _Columns:
         steepest = np.abs(dec[placed]).max()
         base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
-        if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
+        is_a_turn = low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN
+        if is_a_turn and steepest <= RAD_A_TURN / 4:
             return (
                 f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or"
                 " dec_rad"
@@ -303,18 +303,16 @@ class _Columns:
         """The magnitudes of each row by the first conversion that its columns allow."""
         v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
         notes: list[str] = []
-        for route in (
-            route for route in table_reader.ROUTES if route.roles in self.layout.magnitudes
-        ):
+        for route in table_reader.ROUTES:
+            if route.roles not in self.layout.magnitudes:
+                continue
             blank = ~(np.isfinite(v) & np.isfinite(bv))
             if not blank.any():
                 break
-            new_v, new_bv, new_vi = route.convert(
-                *(self.role(role, np.nan)[blank] for role in route.roles)
-            )
-            if np.isfinite(new_v).any() and route.words not in notes:
+            magnitudes = [self.role(role, np.nan)[blank] for role in route.roles]
+            v[blank], bv[blank], vi[blank] = route.convert(*magnitudes)
+            if np.isfinite(v[blank]).any() and route.words not in notes:
                 notes.append(route.words)
-            v[blank], bv[blank], vi[blank] = new_v, new_bv, new_vi
         if "vi_mag" in self.layout.role:
             given = self.role("vi_mag", np.nan)
             vi = np.where(np.isfinite(given), given, vi)
@@ -328,9 +326,8 @@ class _Columns:
         if not all(role in self.layout.role for role in roles):
             return {}
         maximum, period, amplitude = (self.role(role, np.nan) for role in roles)
-        known = (
-            np.isfinite(maximum) & (period > 0) & (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
-        )
+        varies = (period > 0) & (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
+        known = np.isfinite(maximum) & varies
         return {
             "variable": np.where(known, b"P", b"").astype("S1"),
             "range_mag": np.where(known, 2 * amplitude, np.nan).astype(np.float32),
@@ -349,17 +346,16 @@ class _Columns:
             release = "Gaia DR2" if (epoch == GAIA_DR2_JYEAR).all() else "Gaia DR3"
             return release, np.asarray(columns[role["gaia"]], dtype=np.int64)
         if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
-            region, number, part = (
-                np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3")
-            )
-            return TYCHO, region * TYC_REGION + number * 10 + part
+            region = np.asarray(columns[role["tyc1"]], dtype=np.int64)
+            number = np.asarray(columns[role["tyc2"]], dtype=np.int64)
+            component = np.asarray(columns[role["tyc3"]], dtype=np.int64)
+            return TYCHO, region * TYC_REGION + number * 10 + component
         return self.row_numbers()
 
     def row_numbers(self) -> tuple[str, npt.NDArray[np.int64]]:
         """The designation and the number of each row, from 1."""
-        return f"{self.path.stem[:MAX_STEM]} row", np.arange(
-            1, self.table.row_count + 1, dtype=np.int64
-        )
+        numbers = np.arange(1, self.table.row_count + 1, dtype=np.int64)
+        return f"{self.path.stem[:MAX_STEM]} row", numbers
 
     def hip(self) -> npt.NDArray[np.int64]:
         if "hip" not in self.layout.role:
@@ -423,8 +419,13 @@ def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:
 
 
 def _reasons(reason: npt.NDArray[np.int8]) -> str:
-    counts = np.bincount(reason, minlength=len(_REASONS))
-    return ", ".join(f"{counts[k]} {_REASONS[k]}" for k in range(1, len(_REASONS)) if counts[k])
+    """How many rows are not used, by reason."""
+    counts = np.bincount(reason, minlength=len(_REASONS)).tolist()
+    parts = []
+    for count, text in list(zip(counts, _REASONS, strict=True))[1:]:
+        if count:
+            parts.append(f"{count} {text}")
+    return ", ".join(parts)
 
 
 def _repeated_hip(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_]) -> str:
@@ -449,7 +450,8 @@ def _once(
     hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], v_mag: FloatArray
 ) -> npt.NDArray[np.int32]:
     """HIP numbers of which each stands once, at the brightest star that has it."""
-    usable = np.where(kept & (hip > 0) & (hip < 2**31), hip, 0)
+    is_hip = (hip > 0) & (hip < 2**31)
+    usable = np.where(kept & is_hip, hip, 0)
     rows = np.flatnonzero(usable)
     rows = rows[np.argsort(v_mag[rows], kind="stable")]
     _, first = np.unique(usable[rows], return_index=True)
@@ -512,13 +514,11 @@ def _nearest_owner(
         FAR_ARCSEC, float(np.nanmax(hipparcos.separation_arcsec, initial=0.0)) + PAIR_ARCSEC
     )
     tree = cKDTree(unit_vectors_icrs(hipparcos, epoch_jyear))
-    chord, owner = tree.query(
-        unit_vectors_icrs(table, epoch_jyear), distance_upper_bound=reach * RAD_PER_ARCSEC
-    )
-    return (
-        np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1),
-        np.asarray(chord) / RAD_PER_ARCSEC,
-    )
+    table_vectors = unit_vectors_icrs(table, epoch_jyear)
+    chord, owner = tree.query(table_vectors, distance_upper_bound=reach * RAD_PER_ARCSEC)
+    # beyond the reach the tree gives a place after the last
+    near = np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1)
+    return near, np.asarray(chord) / RAD_PER_ARCSEC
 
 
 def _held(
@@ -527,14 +527,14 @@ def _held(
     """The stars of the table (n,) whose light is in their owner's magnitude."""
     fainter_mag = table.v_mag - hipparcos.v_mag[owner]
     separation = np.nan_to_num(hipparcos.separation_arcsec[owner].astype(np.float64), nan=-np.inf)
-    held = (arcsec <= SAME_ARCSEC) | (
-        (arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG)
-    )
+    is_same = arcsec <= SAME_ARCSEC
+    is_of_pair = (arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG)
+    held = is_same | is_of_pair
     alone = np.ones(len(hipparcos), dtype=np.bool_)
     alone[owner[held]] = False
-    return np.asarray(
-        held | (alone[owner] & (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG))
-    )
+    # one that is farther off is the owner where no other is and it is as bright
+    is_alike = (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG)
+    return np.asarray(held | (alone[owner] & is_alike))
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,7 +68,8 @@ class OemOrbit:
         self._unseen_ns = UNSEEN_NS if day else -1
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
-        if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
+        nearest_ns = min(_away_ns(segment, utc_ns) for segment in self._segments)
+        if nearest_ns > DAY_NS:
             spans = ", ".join(_span(s) for s in self._segments[:5])
             raise InputError(
                 f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}"
@@ -85,11 +86,8 @@ class OemOrbit:
         epoch, which is told once.
         """
         segment = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
-        if (
-            not self._told
-            and _away_ns(segment, utc_ns) > 0
-            and abs(utc_ns - self._stars_ns) > self._unseen_ns
-        ):
+        is_away = _away_ns(segment, utc_ns) > 0
+        if is_away and not self._told and abs(utc_ns - self._stars_ns) > self._unseen_ns:
             log.warning(
                 "%s: has no orbit at %s UTC; that of its nearest epoch is held",
                 self._name,
@@ -110,9 +108,8 @@ def _at(
     times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int
 ) -> tuple[FloatArray, FloatArray]:
     """Place and velocity at a time by the NODES states (n, 6) about it."""
-    first = int(
-        np.clip(np.searchsorted(times_ns, t_ns) - NODES // 2, 0, max(0, len(times_ns) - NODES))
-    )
+    centred = np.searchsorted(times_ns, t_ns) - NODES // 2
+    first = int(np.clip(centred, 0, max(0, len(times_ns) - NODES)))
     near = slice(first, first + NODES)
     from scipy.interpolate import KroghInterpolator
 
@@ -127,20 +124,22 @@ def _off_km(segment: Segment) -> float:
     """How far the polynomial is off between epochs, km, by what it is at epochs that are held
     out, where steps are longer.
     """
-    inner = (
-        np.unique(np.linspace(1, len(segment.t_ns) - 2, TRIED).astype(int))
-        if len(segment.t_ns) > 2
-        else ()
-    )
-    worst_km, order = 0.0, 2 * min(NODES, len(segment.t_ns) - 1)
-    for k in inner:
-        near = [i for i in range(k - NODES, k + NODES + 1) if i != k and 0 <= i < len(segment.t_ns)]
+    count = len(segment.t_ns)
+    if count <= 2:
+        return 0.0
+    held_out = np.unique(np.linspace(1, count - 2, TRIED).astype(int))
+    order = 2 * min(NODES, count - 1)
+    worst_km = 0.0
+    for k in held_out:
+        near = [i for i in range(k - NODES, k + NODES + 1) if i != k and 0 <= i < count]
         place, _ = _at(segment.t_ns[near], segment.states[near], int(segment.t_ns[k]))
         worst_km = max(worst_km, float(np.linalg.norm(place - segment.states[k, :3])))
+    # the polynomial's error falls with the step to its order
     return worst_km / float(2**order)
 
 
 def _segments(text: str, name: str) -> Iterator[Segment]:
+    """The segments of a text, one after the other. Raises InputError with the line."""
     meta: dict[str, str] = {}
     rows: list[list[str]] = []
     section = "header"
@@ -174,11 +173,12 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
 
 
 def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator[Segment]:
+    """The segment of some rows; none for the header, which has no frame. Raises InputError."""
     if "REF_FRAME" not in meta and not rows:
         return  # the header
-    frame, centre, scale = (
-        meta.get(key, "missing") for key in ("REF_FRAME", "CENTER_NAME", "TIME_SYSTEM")
-    )
+    frame = meta.get("REF_FRAME", "missing")
+    centre = meta.get("CENTER_NAME", "missing")
+    scale = meta.get("TIME_SYSTEM", "missing")
     if frame not in FRAMES or centre != "EARTH":
         raise InputError(
             f"{name}: REF_FRAME is {frame[:40]} and CENTER_NAME {centre[:40]}; {OEM_ADVICE}"
@@ -189,25 +189,32 @@ def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator
         )
     if len(rows) < 2:
         raise InputError(f"{name}: a segment has {len(rows)} states; it needs two or more")
-    t_ns = np.array([_epoch_ns(row[1], f"{name}:{row[0]}") for row in rows], dtype=np.int64)
-    states = np.array([_numbers(row[2:], f"{name}:{row[0]}") for row in rows])
+    epochs_ns = []
+    states = []
+    for line, epoch, *numbers in rows:
+        where = f"{name}:{line}"
+        epochs_ns.append(_epoch_ns(epoch, where))
+        states.append(_numbers(numbers, where))
+    t_ns = np.array(epochs_ns, dtype=np.int64)
     back = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(back):
         raise InputError(
             f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the"
             " lines by time"
         )
-    yield Segment(scale, t_ns, states)
+    yield Segment(scale, t_ns, np.array(states))
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
+    """A state's six figures. Raises InputError."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = [np.nan] * 6
     place = np.abs(numbers[:3])
     speed = np.abs(numbers[3:])
-    if not ((place < MAX_KM).all() and (speed < MAX_KM_S).all() and np.linalg.norm(place) > MIN_KM):
+    is_orbit = (place < MAX_KM).all() and (speed < MAX_KM_S).all()
+    if not is_orbit or not np.linalg.norm(place) > MIN_KM:
         raise InputError(
             f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s"
         )
@@ -243,6 +250,7 @@ def _epoch_ns(text: str, where: str) -> int:
 
 
 def _time(scale: str, utc_ns: int) -> int:
+    """A UTC, ns since 1970, in another time scale."""
     if scale == "UTC":
         return utc_ns
     year, month, day = (int(part) for part in _date(utc_ns)[:10].split("-"))
@@ -254,6 +262,7 @@ def _time(scale: str, utc_ns: int) -> int:
 
 
 def _date(t_ns: int) -> str:
+    """A time, ns since 1970, to the second."""
     return str(np.datetime64(t_ns, "ns").astype("datetime64[s]"))
 
 

@@ -111,9 +111,8 @@ class Satellite:
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
-        return float(
-            utc_ns / NS_PER_DAY + UNIX_JD - self.satrec.jdsatepoch - self.satrec.jdsatepochF
-        )
+        epoch_jd = self.satrec.jdsatepoch
+        return float(utc_ns / NS_PER_DAY + UNIX_JD - epoch_jd - self.satrec.jdsatepochF)
 
 
 def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
@@ -204,7 +203,8 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
 def _name(line: str) -> str:
     """A name line's name in ASCII, as tables have it; Space-Track writes "0 " before it."""
     text = line[2:] if line.startswith("0 ") else line
-    return printable(text.strip()).encode("ascii", "replace").decode()[:MAX_NAME].strip()
+    ascii_text = printable(text.strip()).encode("ascii", "replace").decode()
+    return ascii_text[:MAX_NAME].strip()
 
 
 def _check(line: str, where: str) -> None:
@@ -254,7 +254,8 @@ class Brightness:
         """
         ratio = flux_ratio(-self.amplitude_mag[which])
         varied = np.where(np.isnan(self.flash_s[which]), 2 * ratio / (ratio + 1), ratio)
-        return np.where(np.isnan(self.period_s[which]), 1.0, varied)
+        is_steady = np.isnan(self.period_s[which])
+        return np.where(is_steady, 1.0, varied)
 
     def variation(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
         """The mean factor of each of these (n,) between two times, seconds after `epoch_utc`, in
@@ -270,36 +271,38 @@ class Brightness:
             return factor
         end_s = np.maximum(end_s, begin_s + SHORTEST_S)
         flashing = ~np.isnan(self.flash_s[which]) & ~steady
-        for chosen, mean in ((~flashing & ~steady, self._waved), (flashing, self._flashed)):
-            factor[chosen] = mean(which[chosen], begin_s[chosen], end_s[chosen])
+        waving = ~flashing & ~steady
+        factor[waving] = self._waved(which[waving], begin_s[waving], end_s[waving])
+        factor[flashing] = self._flashed(which[flashing], begin_s[flashing], end_s[flashing])
         return factor
 
     def _waved(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """As `variation`, of those that go up and down: the cosine's mean is a sinc."""
         ratio = flux_ratio(-self.amplitude_mag[which])
         per_s = 1 / self.period_s[which]
         middle = ((begin_s + end_s) / 2 - self.flash_at_s[which]) * per_s
         depth = (ratio - 1) / (ratio + 1)
-        return np.asarray(
-            1 + depth * np.cos(2 * np.pi * middle) * np.sinc((end_s - begin_s) * per_s)
-        )
+        damping = np.sinc((end_s - begin_s) * per_s)
+        return np.asarray(1 + depth * np.cos(2 * np.pi * middle) * damping)
 
     def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """As `variation`, of those that flash."""
         from scipy.special import ndtr  # 0.1 s, which only flashes need
 
         period_s = self.period_s[which]
         sigma_s = self.flash_s[which] / FWHM_SIGMAS
+        flash_at_s = self.flash_at_s[which]
         # The light of all flashes up to each end, in flashes: whole periods, and those near that
         # have not ended
-        until = []
+        ends = []
         for seconds in (begin_s, end_s):
-            turn = np.floor((seconds - self.flash_at_s[which]) / period_s)
-            rest_s = seconds - self.flash_at_s[which] - turn * period_s
-            near = ndtr((rest_s[:, None] - NEIGHBOURS * period_s[:, None]) / sigma_s[:, None]).sum(
-                axis=1
-            )
-            until.append((turn, near))
-        (turn, near), (last_turn, last_near) = until
-        flashes = (last_turn - turn) + (last_near - near)
+            turn = np.floor((seconds - flash_at_s) / period_s)
+            rest_s = seconds - flash_at_s - turn * period_s
+            since_s = rest_s[:, None] - NEIGHBOURS * period_s[:, None]
+            near = ndtr(since_s / sigma_s[:, None]).sum(axis=1)
+            ends.append((turn, near))
+        (first_turn, first_near), (last_turn, last_near) = ends
+        flashes = (last_turn - first_turn) + (last_near - first_near)
         extra = flux_ratio(-self.amplitude_mag[which]) - 1
         return np.asarray(1 + extra * flashes * sigma_s * np.sqrt(2 * np.pi) / (end_s - begin_s))
 
@@ -315,17 +318,18 @@ def reflected_share(
     distance_au = float(np.linalg.norm(sun_km)) / KM_PER_AU
     to_sun = sun_km / np.linalg.norm(sun_km)  # from any satellite of the Earth within 1 arcmin
     range_km = np.linalg.norm(from_observer_km, axis=1)
-    diffuse = phase_factor(np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0))
-    return np.asarray(
-        (STANDARD_KM / range_km) ** 2 / distance_au**2 * diffuse * sunlit_share(place_km, sun_km)
-    )
+    cos_phase = np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0)
+    by_distance = (STANDARD_KM / range_km) ** 2 / distance_au**2
+    sunlit = sunlit_share(place_km, sun_km)
+    return np.asarray(by_distance * phase_factor(cos_phase) * sunlit)
 
 
 def phase_factor(cos_phase: FloatArray) -> FloatArray:
     """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its
     phase angles.
     """
-    return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - np.arccos(cos_phase)) * cos_phase)
+    phase_rad = np.arccos(cos_phase)
+    return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - phase_rad) * cos_phase)
 
 
 def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
@@ -342,24 +346,26 @@ def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
     far = np.linalg.norm(to_sun, axis=1)
     earth = np.arcsin(np.minimum(1.0, EARTH_KM / distance))
     disc = np.arcsin(SUN_KM / far)
-    apart = np.arccos(np.clip(-np.einsum("ij,ij->i", place, to_sun) / (distance * far), -1.0, 1.0))
+    cosine = -np.einsum("ij,ij->i", place, to_sun) / (distance * far)
+    apart = np.arccos(np.clip(cosine, -1.0, 1.0))
     within = np.abs(earth - disc)
     share = np.where(apart <= within, np.maximum(0.0, 1 - (earth / disc) ** 2), 1.0)
     partly = np.flatnonzero((apart > within) & (apart < earth + disc))
     if len(partly):
-        share[partly] = 1 - _overlap(earth[partly], disc[partly], apart[partly]) / (
-            np.pi * disc[partly] ** 2
-        )
+        hidden = _overlap(earth[partly], disc[partly], apart[partly])
+        share[partly] = 1 - hidden / (np.pi * disc[partly] ** 2)
     return share
 
 
 def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
     """The area that circles of radii a and b share, on a plane."""
     from_a = (apart**2 + a**2 - b**2) / (2 * apart)
-    in_a, in_b = (
-        np.arccos(np.clip(x / r, -1.0, 1.0)) for x, r in ((from_a, a), (apart - from_a, b))
-    )
-    return np.asarray(a**2 * (in_a - np.sin(2 * in_a) / 2) + b**2 * (in_b - np.sin(2 * in_b) / 2))
+    from_b = apart - from_a
+    in_a = np.arccos(np.clip(from_a / a, -1.0, 1.0))
+    in_b = np.arccos(np.clip(from_b / b, -1.0, 1.0))
+    segment_a = a**2 * (in_a - np.sin(2 * in_a) / 2)
+    segment_b = b**2 * (in_b - np.sin(2 * in_b) / 2)
+    return np.asarray(segment_a + segment_b)
 
 
 def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.0) -> FloatArray:
@@ -371,9 +377,8 @@ def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.
     observer = _stretched(observer_km)
     place = _stretched(place_km)
     way = place - observer
-    share = np.clip(
-        -np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0
-    )
+    towards_earth = -np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way)
+    share = np.clip(towards_earth, 0.0, 1.0)
     closest = np.linalg.norm(observer + share[:, None] * way, axis=1)
     inside = np.linalg.norm(observer, axis=1) < EARTH_KM
     return np.where((closest < EARTH_KM - depth_km) & ~inside, 0.0, 1.0)
@@ -383,7 +388,8 @@ def _stretched(vectors_km: FloatArray) -> FloatArray:
     """Vectors in axes in which the Earth is a sphere of its equatorial radius; its axis is ICRS
     z within 0.2 degrees.
     """
-    return np.asarray(vectors_km * np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]))
+    to_sphere = np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)])
+    return np.asarray(vectors_km * to_sphere)
 
 
 def read_table(text: str, file: str) -> dict[int, Row]:
@@ -399,7 +405,8 @@ def read_table(text: str, file: str) -> dict[int, Row]:
         number = _number(table.cell(cells, key), where)
         if number in rows:
             raise InputError(f"{where}: satellite {number} is there twice; leave one row")
-        rows[number] = _values({name: table.cell(cells, column) for name, column in columns}, where)
+        texts = {name: table.cell(cells, column) for name, column in columns}
+        rows[number] = _values(texts, where)
     return rows
 
 
@@ -419,6 +426,7 @@ def _columns(table: TextTable) -> list[tuple[str, Chosen]]:
 
 
 def _number(text: str, where: str) -> int:
+    """A catalogue number, as digits or in Alpha-5. Raises InputError."""
     from sgp4.alpha5 import from_alpha5
 
     try:
@@ -430,6 +438,7 @@ def _number(text: str, where: str) -> int:
 
 
 def _values(row: dict[str, str], where: str) -> Row:
+    """The columns that a row fills, as numbers. Raises InputError."""
     values: Row = {}
     for name, text in row.items():
         if not text:
@@ -466,11 +475,12 @@ def brightness_of(
     `v0_e_per_s` is the electron rate of sunlight of V = 0.
     """
 
-    def column(name: str, default: float) -> np.ndarray:
-        return np.array(
-            [rows.get(satellite.number, {}).get(name, default) for satellite in satellites],
-            dtype=np.float64,
-        )
+    def column(name: str, default: float) -> FloatArray:
+        values = []
+        for satellite in satellites:
+            row = rows.get(satellite.number, {})
+            values.append(row.get(name, default))
+        return np.array(values, dtype=np.float64)
 
     return Brightness(
         standard_e_per_s=v0_e_per_s * flux_ratio(column("standard_mag", default_mag)),
@@ -518,6 +528,7 @@ class Swarm:
         return True
 
     def _load(self, k: int, part: slice, begin_ns: int, follows: bool) -> None:
+        """Make the cubics of a share's step; one that follows the last begins where that ended."""
         last = self._ends[k]
         error = np.zeros(part.stop - part.start, dtype=np.uint8)
         if last is None or not follows:
@@ -534,16 +545,14 @@ class Swarm:
         where there is one.
         """
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
-        error, place_km, velocity_km_s = self._shares[k].sgp4(
-            np.array([UNIX_JD + days]), np.array([rest_ns / NS_PER_DAY])
-        )
-        states = (
-            np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1)
-            @ icrs_from_teme(utc_ns // TURN_NS).T
-        )
-        error = np.where(
-            np.isfinite(states).all(axis=(1, 2)), error[:, 0], np.maximum(error[:, 0], 1)
-        )
+        utc_days = np.array([UNIX_JD + days])
+        utc_rest_days = np.array([rest_ns / NS_PER_DAY])
+        codes, place_km, velocity_km_s = self._shares[k].sgp4(utc_days, utc_rest_days)
+        teme = np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1)
+        states = teme @ icrs_from_teme(utc_ns // TURN_NS).T
+        is_finite = np.isfinite(states).all(axis=(1, 2))
+        error = codes[:, 0]
+        error = np.where(is_finite, error, np.maximum(error, 1))
         states[error != 0] = np.nan
         return states, error
 
@@ -553,7 +562,8 @@ class Swarm:
         """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it
         was moved to; NaN for none.
         """
-        s = ((utc_ns - self._begin_ns[which]) / NS_PER_S + seconds)[:, None] / STEP_S
+        after_s = (utc_ns - self._begin_ns[which]) / NS_PER_S + seconds
+        s = after_s[:, None] / STEP_S
         terms = self._terms[which]
         return np.asarray(terms[:, 0] + s * (terms[:, 1] + s * (terms[:, 2] + s * terms[:, 3])))
 
@@ -563,5 +573,9 @@ class Swarm:
         """
         s = ((utc_ns - self._begin_ns[which]) / NS_PER_S)[:, None] / STEP_S
         a, b, c, d = np.moveaxis(self._terms[which], 1, 0)
-        cubic = a + s * (b + s * (c + s * d)), b + s * (2 * c + s * 3 * d), c + s * 3 * d, d
-        return np.stack([term / STEP_S**power for power, term in enumerate(cubic)])
+        # the cubic about s in place of 0
+        place = a + s * (b + s * (c + s * d))
+        velocity = b + s * (2 * c + s * 3 * d)
+        bend = c + s * 3 * d
+        steps = [term / STEP_S**power for power, term in enumerate((place, velocity, bend, d))]
+        return np.stack(steps)

@@ -38,7 +38,17 @@ GROUPS = {
     "calibrate": (
         "Calibrate",
         CALIBRATE,
-        ("dots", "geometric", "psf", "alignment", "reference", "plan", "photometric", "scale"),
+        (
+            "dots",
+            "geometric",
+            "psf",
+            "focus",
+            "alignment",
+            "reference",
+            "plan",
+            "photometric",
+            "scale",
+        ),
     ),
     "sensor": ("Calibrate", SENSOR, ("import_", "measure")),
     "optics": ("Calibrate", OPTICS, ("map_", "lens", "zernike")),

@@ -3,7 +3,9 @@ by stars.
 """
 
 import json
+import threading
 from collections.abc import Iterator
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +20,18 @@ from hilstar.basics.files import (
     check_ending,
     make_directory,
     refuse_stdout,
+    temporary_folder,
     write_whole,
 )
 from hilstar.cli.declare import argument, option, struct, switch
-from hilstar.cli.image_source import DotOptions, dot_images
+from hilstar.cli.image_source import (
+    DotOptions,
+    ImageOptions,
+    dot_images,
+    exposure_option,
+    handed_on,
+    image_source,
+)
 from hilstar.cli.options import (
     bench_argument,
     check_files,
@@ -215,6 +225,75 @@ def psf(options: PsfOptions, dots_from: DotOptions) -> None:
     lines = lines_of(psf_result)
     lines.append(f"in the bench file, under [tracker.optics]: psf = {options.output.name!r}")
     print_found(options.as_json, summary, lines)
+
+
+@struct
+class FocusOptions:
+    """The options of `hilstar calibrate focus`."""
+
+    bench_file: Path = bench_argument()
+    grab: str | None = option(
+        "CMD|genicam:NAME",
+        "Take the images here: a command as that of first-light ({output}, {pattern},"
+        " {exposure_s}), or a camera.",
+    )
+    virtual: Path | None = option(
+        "TRUTH.toml", "Without hardware: a bench file that says how the bench really is."
+    )
+    images: int | None = option("N", "End after so many images. [at Ctrl-C]", min=1)
+    exposure: float | None = exposure_option()
+    feed: str | None = option(
+        "ENDPOINT", "Hand the dots on to who watches there (tcp://127.0.0.1:5570)."
+    )
+    as_json: bool = json_option()
+
+
+def focus(options: FocusOptions) -> None:
+    """Measure the PSF's sigma in image after image while somebody turns the tracker's ring.
+
+    A line for each image has the figure, the best so far and a curve of the last 40; it says where
+    stars are drawn out or saturate the tracker. Ctrl-C ends it with the best. With --json there is
+    an object for each image, and one of the best at the end.
+    """
+    from hilstar.basics.process.interrupts import stop_on_signal
+    from hilstar.instruments.calibrate.first_light.image_sources import NoImage, Stopped
+    from hilstar.instruments.calibrate.grabbed_dots import exposure_of
+    from hilstar.instruments.calibrate.live_focus import FocusCurve, focus_readings
+    from hilstar.server.bench.bench_file import read_bench_file
+
+    if (options.grab is None) == (options.virtual is None):
+        raise InputError("give --grab CMD or a camera, or --virtual TRUTH.toml: one of them")
+    file = read_bench_file(options.bench_file)
+    check_files([options.virtual], [], file)
+    source_options = ImageOptions(grab=options.grab, virtual=options.virtual)
+    stop = threading.Event()
+    curve = FocusCurve()
+    with (
+        temporary_folder("focus") as folder,
+        closing(image_source(file, source_options)) as source,
+        handed_on(options.feed, source),
+        stop_on_signal(stop),
+    ):
+        exposure_s = exposure_of(file, source, options.exposure)
+        try:
+            for reading in focus_readings(file, source, folder, exposure_s):
+                curve.add(reading)
+                print_found(options.as_json, reading, [curve.line()])
+                if stop.is_set() or reading.number == options.images:
+                    break
+        except Stopped:
+            pass
+        except NoImage:
+            # Ctrl-C at a terminal ends the command of --grab, too.
+            if not stop.is_set():
+                raise
+    best = curve.best
+    if best is None or best.figure is None:
+        raise InputError(curve.why_none())
+    summary = {"best": best, "images": len(curve.readings)}
+    sigma = f"{best.figure.psf_sigma_px:.3f} +- {best.figure.error_px:.3f} px"
+    place = f"image {best.number} of {len(curve.readings)}, after {best.t_s:.0f} s"
+    print_found(options.as_json, summary, [f"best: PSF sigma {sigma}: {place}"])
 
 
 def _monitor_of(display: int | str, modes: tuple[str, ...] = ("",)) -> "MonitorIdentity | None":

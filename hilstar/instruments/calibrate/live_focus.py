@@ -108,6 +108,14 @@ class FocusCurve:
         apart_px = figure.psf_sigma_px - self._best_figure.psf_sigma_px
         return apart_px > SIGMAS_APART * math.hypot(figure.error_px, self._best_figure.error_px)
 
+    def why_none(self) -> str:
+        """Why there is no best image."""
+        if not self.readings:
+            return "no image came"
+        if self.figures:
+            return "the tracker moved in each image; hold it still"
+        return self.readings[-1].why
+
     def line(self) -> str:
         """The newest reading beside the best, as a person at the ring reads it."""
         reading = self.readings[-1]
@@ -127,15 +135,16 @@ class FocusCurve:
             text = f"{text}, best {self._best_figure.psf_sigma_px:.3f} px {ago_s:.0f} s ago"
         else:
             text = f"{text}, as the best"
-        return f"{text}  {sparkline([other.psf_sigma_px for other in self.figures])}"
+        sigmas_px = [other.psf_sigma_px for other in self.figures]
+        return f"{text}  {sparkline(sigmas_px, SIGMAS_APART * figure.error_px)}"
 
 
-def sparkline(values: list[float]) -> str:
-    """The last CURVE_WIDTH values as bars, the smallest the lowest."""
+def sparkline(values: list[float], least_span: float) -> str:
+    """The last CURVE_WIDTH values as bars, the smallest the lowest; the highest bar is at least
+    `least_span` above it, so that noise is no curve.
+    """
     shown = np.array(values[-CURVE_WIDTH:])
-    span = np.ptp(shown)
-    if span == 0:
-        return BARS[0] * len(shown)
+    span = max(float(np.ptp(shown)), least_span)
     heights = np.rint((shown - shown.min()) / span * (len(BARS) - 1)).astype(int)
     return "".join(BARS[height] for height in heights)
 
@@ -165,9 +174,10 @@ def focus_readings(
         image = source.pixels(path, tracker.resolution_px)
         peak_dn = float(image[cold].max(initial=0.0))
         if peak_dn >= DOT_FILL * tracker.detector.saturation_dn:
-            code = darker_code(code)
-            why = f"dots saturate the tracker: code {code} in their place"
+            darker = darker_code(code)
+            why = f"dots saturate the tracker: code {darker} in their place"
             yield FocusReading(number, t_s, code, None, why)
+            code = darker
             continue
         try:
             sharp = seen_sharpness(image - dark, seen_screen, tracker.detector)

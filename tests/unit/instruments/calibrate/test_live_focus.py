@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import ExitStack, closing
 
 import numpy as np
@@ -11,6 +12,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import ImageSource,
 from hilstar.instruments.calibrate.live_focus import FocusCurve, focus_readings, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
+from tests.support.commands import run_hilstar_here
 
 RING_PX = (3.0, 2.0, 1.4, 1.0, 0.8, 1.1, 1.6)  # sigma of the PSF as the ring is turned
 BEST = 5  # the image of the sharpest
@@ -111,9 +113,27 @@ def test_dots_that_saturate_have_no_figure_and_are_dimmed(benches, tmp_path):
         images = focus_readings(file, source, tmp_path, 1.0)
         reading = next(images)
         assert reading.figure is None and "saturate" in reading.why
-        assert next(images).code < reading.code or reading.code < 2**10 - 1
+        assert next(images).code < reading.code == 2**10 - 1
+
+
+def test_the_command_ends_with_the_best_image(benches, tmp_path):
+    _, truth = benches
+    bench = tmp_path / "truth-1.0.toml"
+    words = ("--images", "3", "--exposure", str(EXPOSURE_S), "--json")
+    done = run_hilstar_here("calibrate", "focus", bench, "--virtual", truth(1.4).path, *words)
+    assert done.returncode == 0, done.stderr
+    *figures, last = [json.loads(line) for line in done.stdout.splitlines()]
+    best = last["best"]["figure"]
+    assert [figure["number"] for figure in figures] == [1, 2, 3]
+    assert abs(best["psf_sigma_px"] - 1.4) < SURE_SIGMAS * best["error_px"]
+
+
+def test_the_command_without_images_says_what_to_give(benches, tmp_path):
+    done = run_hilstar_here("calibrate", "focus", tmp_path / "truth-1.0.toml")
+    assert done.returncode == 2
+    assert "give --grab CMD or a camera, or --virtual TRUTH.toml" in done.stderr
 
 
 def test_a_curve_is_as_high_as_its_values():
-    assert sparkline([3.0, 2.0, 1.0, 2.0, 3.0]) == "█▅▁▅█"
-    assert sparkline([1.0, 1.0]) == "▁▁"
+    assert sparkline([3.0, 2.0, 1.0, 2.0, 3.0], 0.1) == "█▅▁▅█"
+    assert sparkline([1.0, 1.01], 0.1) == "▁▂"

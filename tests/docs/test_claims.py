@@ -96,7 +96,7 @@ def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """README, docs, rows, tests, and the files that have what is given."""
     folder = tmp_path_factory.mktemp("copy")
     names = ["README.md", "claims.toml"]
-    for pattern in ("docs/*.md", "tests/**/*.py", "hilstar/**/*.py"):
+    for pattern in ("docs/*.md", "tests/**/*.py", "hilstar/**/*.py", "configs/*.toml"):
         names += [path.relative_to(ROOT).as_posix() for path in ROOT.glob(pattern)]
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

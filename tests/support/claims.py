@@ -43,7 +43,6 @@ UNMARKED_PAGES = (
     "docs/camera.md",
     "docs/commands.md",
     "docs/python-api.md",
-    "docs/the-light.md",
     "docs/tracker.md",
     "docs/where-it-fails.md",
 )

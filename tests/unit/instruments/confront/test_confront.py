@@ -46,7 +46,7 @@ exposure_s = 0.2
 """
 # The issue's aims for this camera, which was measured apart: 16 DN a step, 2.64 e- a step, 5114 px
 # by 40.33 arcsec/px.
-MAX_RMS_PX, MAX_RMS_MAG = 0.07, 0.11
+MAX_RMS_PX = 0.07
 HELD_OUT = 1.3
 SIGMAS = 3.0
 HOT = ((100, 200), (300, 50), (400, 600))
@@ -124,7 +124,7 @@ def test_a_picture_that_is_made_smaller_keeps_its_stars() -> None:
 def test_raw_frames_agree_within_the_aims(raw: tuple[Path, dict[str, Any]]) -> None:
     _, found = raw
     holds("confronted-places", found["excess"]["rms_px"])
-    assert found["excess"]["rms_mag"] < MAX_RMS_MAG
+    holds("confronted-light", found["excess"]["rms_mag"])
     assert all(0.9 <= image["background_chi2"] <= 1.1 for image in found["images"])
 
 

@@ -188,7 +188,7 @@ def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
     if program is None:
         pytest.skip("arv-camera-test-0.8 is not installed (aravis-tools)")
     address = own_address()
-    with tracker(display, "--camera", address) as process:
+    with tracker_with_camera(display, "--camera", address) as process:
         with GigEClient(address) as client:
             opened(client)
         tested = subprocess.run(

@@ -27,7 +27,10 @@ Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
 # Below this radius (PSF and pixel combined) a disc's limb and centre cannot be told apart;
 # disc.frag is off by 1 % at 5.5.
 SMALL_SIGMAS = 8.0
-NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
+# Along a radius. In the face's middle places are then up to pi^3 / 4 / 5 = 1.55 sigma apart, and
+# the face is uneven by 2 exp(-2 pi^2 / 1.55^2) = 5e-4; with 4 it would be 1 %, also of the Sun
+# behind.
+NODES_A_SIGMA = 5.0
 # coverage that counts as a whole pixel: the rest is rounding, and the Sun behind may be 1e9 times
 # white
 WHOLE = 0.999

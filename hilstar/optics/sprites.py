@@ -76,24 +76,21 @@ class Candidates:
         keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
-            same = (
+            same_stars = (
                 stars.vectors is last.vectors
                 and stars.electrons_per_s is last.electrons_per_s
                 and stars.grid is last.grid
             )
+            same_image = camera is last_camera and margin_px == last_margin_px
             difference = (icrs_to_image - last_icrs_to_image).ravel()
             # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from
             # R to S: roll counts as well.
             chord = math.sqrt(float(difference @ difference) / 8)
             turned_rad = 2 * math.asin(min(1.0, chord))
-            if (
-                same
-                and camera is last_camera
-                and margin_px == last_margin_px
-                and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD
-            ):
+            if same_stars and same_image and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
                 return near
-        star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
+        reach_rad = KEPT_TURN_RAD if keeps else 0.0
+        star = stars_about(stars, icrs_to_image, camera, margin_px, reach_rad)
         near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
         if keeps:
             self._kept = stars, camera, margin_px, icrs_to_image.copy(), near

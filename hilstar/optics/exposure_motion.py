@@ -162,7 +162,9 @@ def smeared_sprites(
 
 @dataclass(frozen=True, slots=True)
 class _Smear:
-    """Stars smeared on one image."""
+    """How stars are smeared on an image: its camera and PSF, the nodes to a sigma of their paths,
+    and how its rows are exposed.
+    """
 
     stars: Stars
     camera: Camera

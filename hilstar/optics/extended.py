@@ -326,7 +326,7 @@ class FacePlaces(NamedTuple):
 
 
 def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
-    """Places of the face that have a pixel."""
+    """The places of a disc's face that have a pixel, and their light."""
     directions, law_sr = disc.points(nodes)
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)

@@ -92,8 +92,8 @@ FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in it
 
 
 class ShareShader(NamedTuple):
-    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w,
-    channels).
+    """What shares.glsl needs of a PSF: lines to define before it, its uniforms by name, and its
+    table (h, w, channels), if it has one.
     """
 
     defines: tuple[str, ...]
@@ -102,10 +102,11 @@ class ShareShader(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far a share of light may lie from its star: an ellipse.
+    """The ellipse about a star within which a pixel of its footprint can get more than a share s of
+    its light.
 
-    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 /
-    `axes_px2[1]` under log(`factor` / s).
+    It is x^2 / `axes_px2[0]` + y^2 / `axes_px2[1]` < log(`factor` / s), with x and y from the star,
+    px.
     """
 
     axes_px2: tuple[float, float]
@@ -323,7 +324,7 @@ class GaussianPsf(Psf):
     def stamps(
         self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
     ) -> Float32Array:
-        """Row by row the product of what each column and each row has."""
+        """See `Psf.stamps`: the share of each column times the share of each row."""
         from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
         edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
@@ -366,7 +367,7 @@ class GaussianPsf(Psf):
         return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """Axis by axis, from the complements of both edges."""
+        """See `Psf.cut_share`: axis by axis, from the complements of both edges."""
         inside = 1.0
         for sigma in self.sigma_px:
             beyond_near = math.erfc((size_px / 2 - 0.5) / (sigma * SQRT2))
@@ -375,7 +376,7 @@ class GaussianPsf(Psf):
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
-        """The share of a pixel beside the middle of an edge."""
+        """See `Psf.outside_share`: that of a pixel beside the middle of an edge."""
         sigma_x, sigma_y = self.sigma_px
         beyond_px = size_px / 2
         beside_x = pixel_share(beyond_px, sigma_x) * pixel_share(0.0, sigma_y)
@@ -619,7 +620,9 @@ class SampledPsf(Psf):
         return image.astype(np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """The largest of the four corners' of a pixel, by the shares at half pixels."""
+        """See `Psf.cut_share`: the largest for stars on the four corners of a pixel, by the shares
+        at half pixels.
+        """
         first = len(self._halves) // 2 - size_px
         if first < 0:
             return 0.0
@@ -632,15 +635,15 @@ class SampledPsf(Psf):
         return 1 - least
 
     def outside_share(self, size_px: int) -> float:
-        """The largest of the table beyond half of that side."""
+        """See `Psf.outside_share`: the largest share of the table beyond half of that side."""
         from_middle = np.abs(np.arange(len(self._table)) - len(self._table) // 2)
         far = from_middle >= size_px * self._steps / 2
         largest = max(self._table[far].max(initial=1e-30), self._table[:, far].max(initial=1e-30))
         return float(largest)
 
     def shader(self, side_px: int) -> ShareShader:
-        """The same table: in each cell between four places what its bilinear interpolation is
-        made of.
+        """See `Psf.shader`: the table by cells of its grid, each with its four coefficients of
+        bilinear interpolation.
         """
         near = self._table[:-1, :-1]
         right = self._table[:-1, 1:]
@@ -699,10 +702,11 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
 
 
 def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
-    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and
-    the PSF of each.
+    """Gaussians that together stand for the light of an evenly lit square: their places along its
+    side, in sides from its middle, and the PSF of each.
 
-    The PSF is `psf` with what the points lack of the square's variance; `side_px` is in its pixels.
+    The PSF is `psf`, widened by the variance of the square that the places lack; `side_px` is in
+    its pixels.
     """
     narrow_px = min(psf.width_px)
     if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:

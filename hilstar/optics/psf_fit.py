@@ -154,7 +154,9 @@ class PixelGaussians:
 
 
 def bounded(covariance: FloatArray) -> FloatArray:
-    """Covariances (n, 3) that are some: variances not under the smallest, and no line."""
+    """Covariances (n, 3), px^2, kept to those of a Gaussian: variances of MIN_VARIANCE_PX2 or more,
+    a correlation of up to MAX_CORRELATION.
+    """
     xx, yy = np.maximum(covariance[:, :XY], MIN_VARIANCE_PX2).T
     most = MAX_CORRELATION * np.sqrt(xx * yy)
     return np.stack([xx, yy, np.clip(covariance[:, XY], -most, most)], axis=1)
@@ -173,7 +175,9 @@ def normal_equations(
 
 
 def amplitudes(columns: Sequence[FloatArray], weight: FloatArray, images: FloatArray) -> FloatArray:
-    """How much (n, c) of each column (n, h, w) images (n, h, w) have, by weighted least squares."""
+    """The factors (n, c) by which columns (n, h, w) add up to images (n, h, w), by weighted least
+    squares.
+    """
     count = len(images)
     flat = np.stack(columns, axis=1).reshape(count, len(columns), -1)
     normal, right = normal_equations(flat, weight.reshape(count, -1), images.reshape(count, -1))

@@ -76,8 +76,8 @@ def extinction_names() -> tuple[str, ...]:
 
 
 def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
-    """A tracker's optics behind so many air masses; the ends of a table of extinction hold
-    beyond it.
+    """A tracker's optics behind so many air masses. Beyond a table of extinction its end values
+    hold.
     """
     low, high = optics.range_nm
     knots = [c.wavelength_nm for c in (optics.transmission, extinction) if len(c.wavelength_nm)]
@@ -94,8 +94,8 @@ def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
 def dimmed_mag(
     rates: Callable[[Optics], FloatArray], optics: Optics, extinction: Curve
 ) -> FloatArray:
-    """How much fainter (masses, n) spectra are behind AIR_MASSES; `rates` gives their electrons
-    through optics.
+    """How much fainter spectra are behind AIR_MASSES, mag (masses, n); `rates` gives their
+    electrons (n,) through optics.
     """
     by_masses = []
     for masses in AIR_MASSES.tolist():
@@ -107,8 +107,8 @@ def dimmed_mag(
 def glow_e_per_s_arcsec2(
     spectrum: Curve, v_mag_arcsec2: float, optics: Optics, photometry: Photometry
 ) -> float:
-    """Electrons per second and square arcsecond of a sky of this V and a spectrum's shape: as
-    zodiacal light's.
+    """Electrons per second and square arcsecond of a night sky of this V surface brightness, with
+    the shape of a spectrum.
     """
     passband = load_curve("johnson-v", "johnson-v")
     nm, weight_m = integration_nodes(passband, spectrum)
@@ -123,8 +123,8 @@ def glow_e_per_s_arcsec2(
 
 
 def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Curve:
-    """A curve with the knots of another within a range, so that a product of both is integrated
-    as it is.
+    """A curve with the knots of another within a range added, so that the product of both is
+    integrated exactly.
     """
     low, high = range_nm
     nm = np.unique(np.concatenate([curve.wavelength_nm, other.wavelength_nm, range_nm]))
@@ -134,12 +134,12 @@ def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Cur
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteAir:
-    """The air of a place: `up_at` a UTC, ns, the constants of refraction, rad, and how it dims,
-    glows and twinkles.
+    """The air over a place: the zenith (`up_at` a UTC, ns), the constants of refraction, rad, and
+    how it dims stars, glows and makes them twinkle.
 
-    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last
-    sunlight. `glow_e_per_s_sr` (channels,) is that at the zenith, and `v_extinction_mag` that of V
-    by air mass.
+    `dimming_mag` (channels, masses, n + 1) is that of each star of the catalogue by row, and last
+    of sunlight. `glow_e_per_s_sr` (channels,) is the glow at the zenith, `v_extinction_mag` the
+    extinction of V for an air mass.
     """
 
     up_at: Callable[[int], FloatArray]

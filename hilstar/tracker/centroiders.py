@@ -127,6 +127,7 @@ def _axis(stamps: FloatArray) -> FloatArray:
 
 
 def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
+    """See the module: places (n,) by the plain first moment."""
     at = _axis(stamps)
     light = stamps.sum(axis=(1, 2))
     x = stamps.sum(axis=1) @ at / light
@@ -142,6 +143,9 @@ def _window(
     wide: float = 1.0,
     steps: int = WINDOW_STEPS,
 ) -> Places:
+    """See the module: places (n,) by a Gaussian window, `wide` times as wide as the star, that
+    follows it.
+    """
     at = _axis(stamps)
     x, y = _box(stamps, 2, pixels)
     sigma_x, sigma_y = (wide * max(sigma, MIN_WINDOW_PX) for sigma in sigma_px)
@@ -169,6 +173,7 @@ def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
 
 
 def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
+    """See the module: places (n,) by least squares of a Gaussian, after some steps of a window."""
     at = _axis(stamps)
     x, y = _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
     sigma_x, sigma_y = sigma_px
@@ -238,6 +243,9 @@ def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> Places:
 
 
 def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE) -> Places:
+    """See the module: places (n,) by the centre of mass of boxes that reach `half` pixels from
+    `pixels`.
+    """
     rows, columns = pixels
     side = stamps.shape[1]
     near = np.arange(-half, half + 1)

@@ -283,6 +283,7 @@ class Detector:
         return light_e
 
     def _check_light(self, light_e: npt.NDArray[Any]) -> None:
+        """Raise InputError for electrons that are negative, not a number, or too many."""
         if not light_e.min() >= 0:  # NaN propagates through min
             raise InputError(
                 "a pixel's electrons are negative or NaN; give expected electrons, 0 or more"
@@ -290,6 +291,7 @@ class Detector:
         self._check_largest(light_e)
 
     def _check_largest(self, expected_e: npt.NDArray[Any]) -> None:
+        """Raise InputError for more electrons in a pixel than can be drawn."""
         largest_e = expected_e.max()
         if not largest_e <= MAX_E:
             raise InputError(
@@ -298,6 +300,7 @@ class Detector:
             )
 
     def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:
+        """The charge that the wells hold, what exceeds them cut off or spilt along columns."""
         full_e = self.settings.full_well_e
         if self.settings.blooming:
             return bloom(collected_e, full_e)

@@ -226,6 +226,7 @@ class CountTable(NamedTuple):
 
 @cache
 def _count_table() -> CountTable:
+    """The table for means under TABLE_BELOW_E, made once."""
     from scipy.special import ndtri, pdtr
 
     mean_e = np.arange(int(TABLE_BELOW_E) * ROWS_PER_E + 1) / ROWS_PER_E

@@ -290,6 +290,7 @@ class Simulator(Closing):
     def _digitised(
         self, mean_e: FloatArray, rng: np.random.Generator | None
     ) -> npt.NDArray[np.uint16]:
+        """The DN of mean electrons (h, w), with noise by a generator or without."""
         exposure_s = self.config.tracker.exposure_s
         if rng is None:
             return self.detector.expose_noiseless(mean_e, exposure_s)

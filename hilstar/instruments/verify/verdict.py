@@ -44,8 +44,8 @@ class DisplayErrors:
         return len(self.stars) + len(self.lost)
 
     def of(self, name: str) -> FloatArray:
-        """One of the stars' errors (n,), by the name of `Star`'s field; NaN of codes that lose
-        the star.
+        """One of the stars' figures (n,), by the name of `Star`'s field; NaN where the codes alone
+        lose the star.
         """
         return np.array([getattr(star, name) for star in self.stars])
 
@@ -84,7 +84,7 @@ def p95(errors: FloatArray) -> float:
 
 
 def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """The reasons against a bench; none where it passes."""
+    """Every reason against a bench, in words; none where it passes."""
     too_wide = _too_wide(measured)
     if not errors.looked_for:
         return [_none(measured), *too_wide]

@@ -574,7 +574,7 @@ class _Chiefs:
     lens: Lens | None
 
     def places_mm(self, tangents: FloatArray) -> FloatArray:
-        """Where it has directions (n, 2)."""
+        """Places (n, 2), mm from the detector's middle, of directions (n, 2) by their tangents."""
         if self.lens is None:
             return np.asarray(self.focal_length_mm * tangents)
         u, v = self.lens.bent(*tangents.T)

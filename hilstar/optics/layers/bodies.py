@@ -282,6 +282,6 @@ def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | No
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:
-    """The places of discs among `stars`, whose last are the bodies."""
+    """The rows of bodies among `stars`, by name: bodies are the last rows."""
     last_first = stars.bodies[::-1]  # a satellite may have a body's name; satellites come before
     return np.array([len(stars) - 1 - last_first.index(name) for name in names], dtype=np.intp)

@@ -398,6 +398,7 @@ class MovingSky:
         return diameters
 
     def _compute_span(self, span: int) -> Span:
+        """The cubics of a span, through four places of each body and of the Earth."""
         if self._unix:
             date = tdb_of_utc(self._utc_ns + span * SPAN_NS)
         else:
@@ -457,11 +458,13 @@ class MovingSky:
         return disc.of_rate(rate)
 
     def _earth_disc(self, sight: Sight) -> Disc:
+        """The Earth's disc as seen, with its light."""
         v0_e_per_s = float(self._bodies.v0_e_per_s[self.names.index(EARTH)])
         from_sun_km = sight.view.from_sun_km - sight.place_km
         return earth_disc(-sight.place_km, from_sun_km, sight.about_earth_km_s, v0_e_per_s)
 
     def _compute_light(self, moment: SkyMoment) -> tuple[FloatArray, FloatArray]:
+        """V and electrons per second (n,) of the bodies at a moment."""
         sight = self._sight(moment)
         jyear = self._jyear(moment.since_ns / NS_PER_S)
         from_sun_km = sight.seen_km + sight.view.from_sun_km

@@ -249,8 +249,8 @@ class Brightness:
     size_m: FloatArray
 
     def most(self, which: IntArray) -> FloatArray:
-        """The largest factor by which each of these is ever brighter than its mean (in a flash:
-        than without).
+        """The largest factor (n,) by which these are ever brighter than their mean; of those that
+        flash, than without a flash.
         """
         ratio = flux_ratio(-self.amplitude_mag[which])
         varied = np.where(np.isnan(self.flash_s[which]), 2 * ratio / (ratio + 1), ratio)
@@ -493,7 +493,9 @@ def brightness_of(
 
 
 class Swarm:
-    """Satellites by their elements; a moment's places depend on that moment alone."""
+    """Satellites moved by their elements (SGP4) in steps of STEP_S, with cubics between; a place
+    depends on its moment alone.
+    """
 
     def __init__(self, satrecs: "Sequence[Satrec]") -> None:
         from sgp4.api import SatrecArray

@@ -37,6 +37,7 @@ SQRT2 = math.sqrt(2.0)
 # 4.4e-7 off.
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
+# distances that the polynomial is fitted to; rounds of Lawson's weights
 FIT_PLACES, FIT_ROUNDS = 120, 15
 BOUND_PLACES = 200  # along an axis, at which an upper bound is taken
 # The rational approximation of erf in shaders/shares.glsl, above and below the line, the highest

@@ -19,10 +19,12 @@ from hilstar.sky.electrons import Optics, Photometry, electron_response, referen
 from hilstar.sky.spectrum import DATA_DIR, Curve, integration_nodes, load_curve
 from hilstar.sky.stars import AirAbove, Stars, tell
 
+# at which rates are tabulated; magnitudes are linear between them
 AIR_MASSES = np.array([0.0, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0])
 EXTINCTION, NIGHT_SKY = DATA_DIR / "extinction.csv", DATA_DIR / "night_sky.csv"
 VAN_RHIJN = 0.96  # an emitting layer at 130 km
 STEP_NS = NS_PER_S  # the zenith of a second: 15 arcsec, 0.4 mmag at an air mass of 5
+# of the Sun's altitude: above it the sky is brighter than a night's table says
 TWILIGHT_DEG = -12.0
 MAX_TWINKLE = 1.0  # beyond it, near the horizon, the law of weak scintillation ends
 

@@ -52,7 +52,7 @@ NOISE = 0.13
 LATE_SUBCLASS = (55.0, 65.0)
 LATE_EXTRA = 1.5
 TREND_DEGREE = 3  # of the polynomial in V-I that the rates' logarithms depart from
-BLOCK_STARS = 4000
+BLOCK_STARS = 4000  # evaluated at once, which bounds the memory
 
 
 def luminosity_class(spectral_type: npt.NDArray[np.bytes_]) -> npt.NDArray[np.str_]:

@@ -87,7 +87,7 @@ NO_IDENTIFIER = (
 )
 VERSION = 4  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
-HASH_BYTES = 1 << 22
+HASH_BYTES = 1 << 22  # read at once
 MAX_STORED_BYTES = 3_000_000_000
 DTYPES = {"hip": "i4", "identifier": "i8", "variable": "S1", "multiple": "S1"} | dict.fromkeys(
     ("range_mag", "period_d", "separation_arcsec"), "f4"

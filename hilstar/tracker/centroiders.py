@@ -21,16 +21,16 @@ Centroider = Literal[Kind, "psf"]  # which is `fit` where a star is a Gaussian
 FAMILY: tuple[Kind, ...] = get_args(Kind)
 WIDE = 1.5  # in units of the star's sigma
 MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
-FIT_STEPS, WINDOW_STEPS = 8, 20
+FIT_STEPS, WINDOW_STEPS = 8, 20  # at most: stars that have settled end them before
 FIRST_STEPS = 3  # steps with a window before a fit
 # A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both
 # come to rest by this.
 PACE = 1.5
-SETTLED_PX = 1e-6
+SETTLED_PX = 1e-6  # a step under it moves no star any more
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02  # of its brightest pixel: darker ones do not count in a box
 BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}
-MIN_LIGHT = 1e-30
+MIN_LIGHT = 1e-30  # a square with less is dark
 SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
 
 

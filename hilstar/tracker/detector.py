@@ -42,7 +42,7 @@ RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
 RAY_STEP_PX = 0.25  # along a track, so that no pixel that it crosses is passed over
 
-FALSE_STAR_REACH_SIGMAS = 5.0
+FALSE_STAR_REACH_SIGMAS = 5.0  # beyond it lie 6e-7 of a Gaussian's light along an axis
 CodeArray = npt.NDArray[np.uint16]
 ChargeArray = npt.NDArray[Any]  # float64 in `noise_version = 1`, else float32
 

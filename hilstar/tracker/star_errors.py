@@ -31,7 +31,7 @@ BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centr
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
 GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
-MIN_BLUR_PX = 1e-3
+MIN_BLUR_PX = 1e-3  # in place of none, by which places would be divided
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,12 +42,13 @@ MAX_STEPS, MIN_STEPS, TABLE_SIDE, PLACES_A_PX = 4, 2, 1024, 32
 # What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids
 # and second moments are kept.
 STAMP_TOLERANCE = 3e-4
-FIRST_STAMPS, MAX_STAMPS = 48, 400
+FIRST_STAMPS, MAX_STAMPS = 48, 400  # the first number that is tried, doubled up to the last
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
-MAX_GRID_DEGREE = 4
-ON_EDGE_PX = 1e-6
+MAX_GRID_DEGREE = 4  # of splines over a full grid
+ON_EDGE_PX = 1e-6  # of the field's scale: rounding, by which a point on the hull is outside it
 SMALLEST, DARK = 1e-15, 1e-12  # numbers, and illuminations, that count as none
-SPRITES_AT_ONCE_PX = 2_000_000
+SPRITES_AT_ONCE_PX = 2_000_000  # bounds the memory: their stamps take 8 MB
+# samples to a pixel; rounds in which a weight becomes as wide as a PSF
 MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
 # basis images of the simpler glasses that may stand for one
 COMPONENTS = (3, 6, 12)

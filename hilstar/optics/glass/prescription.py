@@ -50,6 +50,7 @@ MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does n
 # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
 PERIOD_MARGIN = 2.0
 FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
+# Newton's rounds from a place to its field; distortion is fitted to rays along spokes of the field
 CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
 EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
 MIN_LIT = 1e-3  # share of a pupil below which a field point is dark

@@ -37,7 +37,7 @@ MAX_POSED_PX = 120
 # Poses in an exposure for each sigma that the camera moves: a limb is then a chain of edges at most
 # 1.6 sigma apart.
 EXPOSED_PER_SIGMA = 1.0
-MAX_EXPOSED = 63
+MAX_EXPOSED = 63  # poses, which bounds an exposure's work; odd, so that one is in the middle
 # places of a limb that are asked whether they are hidden: a body hides another's outline as a whole
 LIMB_PLACES = 24
 LATTICE = 9  # places along each side of a disc's rectangle at which clipping is tested

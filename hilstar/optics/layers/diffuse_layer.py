@@ -22,8 +22,8 @@ from hilstar.optics.sprites import FrameLight
 from hilstar.sky.diffuse import TangentImage
 from hilstar.sky.stars import Stars
 
-CELL_PX = 16
-ON_EDGE_PX = 0.01
+CELL_PX = 16  # side of cells: places are computed at their corners, and linear between these
+ON_EDGE_PX = 0.01  # of a tangent image: two faces of a cube both hold their common edge
 MOVED_PX = 0.25  # at most, by taking one attitude for a cell of them
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 # Limits of the work: sprites of all satellites together in a frame (the cost of 60 stars' paths of
 # 16 px) and in an exposure, and poses of one disc.
 FRAME_SPRITES, EXPOSURE_SPRITES = 1000, 200_000
+# discs along a satellite's path: they bound the work of an image
 FRAME_POSES, EXPOSURE_POSES = 33, 500
 ROW_ROUNDS = 2  # as for stars: see `scene.frame_motion`
 

@@ -25,7 +25,7 @@ NODES = 4  # 1e-6 km of a low orbit at four minutes
 # to beyond the Lagrange points; a state in metres is outside one of them
 MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3
 FAR_KM = 1.0  # half an arcsecond of the Moon
-TRIED = 50
+TRIED = 50  # epochs that are held out in turn: they bound the time that a long file takes
 DAY_NS = 86_400 * NS_PER_S
 # magnitudes are those of a minute's beginning, places those of two steps
 UNSEEN_NS = 120 * NS_PER_S

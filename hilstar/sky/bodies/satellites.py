@@ -65,7 +65,7 @@ NUMBERS = {
     },
 }
 DIGIT_SUM = {ord(c): int(c) if c.isdigit() else int(c == "-") for c in map(chr, range(128))}
-STANDARD_KM = 1000.0
+STANDARD_KM = 1000.0  # the range that a standard magnitude is for, at 90 degrees of phase
 SUN_KM, KM_PER_AU = 695_700.0, 149_597_870.7
 EARTH_KM, EARTH_FLATTENING = 6378.137, 1 / 298.257  # IERS Conventions 2010
 MAX_PHASE_FACTOR = np.pi  # at full phase

@@ -3,9 +3,8 @@ before levels are chosen.
 
 Its unit is that of the linear image, electrons per second of each pixel. It travels in a frame's
 `FrameLight.extended` and is drawn in order, before the sprites. Compared by identity: one object
-drawn
-twice is the same light. A small disc is a map of its spread places, a larger one is drawn ray by
-ray.
+drawn twice is the same light. A small disc is a map of its spread places, a larger one is drawn ray
+by ray.
 """
 
 from dataclasses import dataclass, replace
@@ -107,8 +106,7 @@ class DiscLight:
     """A body's disc through a camera, spread by a PSF; `icrs_to_image` (3, 3) as for sprites.
 
     Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it.
-    `disc_lights`
-    chooses between it and, for a small disc, a map.
+    `disc_lights` chooses between it and, for a small disc, a map.
     """
 
     disc: Disc

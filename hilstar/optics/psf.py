@@ -25,10 +25,9 @@ from hilstar.basics.image_files import ImageSizeError, opened_fits
 from hilstar.basics.reading import read_bytes
 
 # The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would
-# be enough for the
-# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the
-# cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a
-# tenth and cut 4e-5 mag.
+# be enough for the flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of
+# that is cut, at the cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the
+# front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 MAX_GAUSSIAN_PX = 100_000  # the largest footprint that is tried
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
@@ -120,9 +119,8 @@ class Psf(ABC):
 
     `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum. One
     that does has an odd footprint and overrides `stamps_at`, `image` and `centroids_px`: those who
-    draw ask these.
-    A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths, or (n, L) of n
-    stars; `mean_shares` (L,) are those of light without a spectrum of its own.
+    draw ask these. A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths,
+    or (n, L) of n stars; `mean_shares` (L,) are those of light without a spectrum of its own.
     """
 
     by_place = False

@@ -128,15 +128,14 @@ class FrameLight:
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1)
     // 2`. A star's light is divided among up to `per_star` sprites. `capped` stars are drawn
-    coarser than they should be, or not at all, because
-    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as
-    paths, None for points. `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that
-    changes over the field; None draws all by its mean. `extended` is the frame's light other than
-    stars, in the order in which it is drawn; `discs` names the bodies among it, and `over_white`
-    those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for
-    `star`.
-    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each,
-    and `lights` the extended light of each, moved to where that primary has to be drawn.
+    coarser than they should be, or not at all, because the work of a frame is bounded.
+    `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
+    `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field;
+    None draws all by its mean. `extended` is the frame's light other than stars, in the order in
+    which it is drawn; `discs` names the bodies among it, and `over_white` those of them that are
+    brighter than white. Sprites of `added` light have -1, -2 and on for `star`. Where the monitor's
+    primaries are driven apart, `primaries` float32 (n, 3) is the light of each, and `lights` the
+    extended light of each, moved to where that primary has to be drawn.
     """
 
     data: npt.NDArray[np.void]

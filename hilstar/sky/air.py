@@ -1,10 +1,10 @@
 """The air over a place on the Earth: it bends light, dims it, glows, and makes stars twinkle.
 
-Refraction is that of `stars.AirAbove`. The air mass
-is Kasten and Young's (1989, Appl. Opt. 28, 4735). Extinction is that of each star's own spectrum,
-tabulated at AIR_MASSES and straight between them. The glow of the sky goes with the zenith distance
-by van Rhijn's layer and with extinction (Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and
-3). Stars twinkle by Young's law (1967, AJ 72, 747).
+Refraction is that of `stars.AirAbove`. The air mass is Kasten and Young's (1989, Appl. Opt. 28,
+4735). Extinction is that of each star's own spectrum, tabulated at AIR_MASSES and straight between
+them. The glow of the sky goes with the zenith distance by van Rhijn's layer and with extinction
+(Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and 3). Stars twinkle by Young's law (1967, AJ
+72, 747).
 """
 
 from collections.abc import Callable

@@ -83,9 +83,8 @@ class Catalog:
     `range_mag` in Hp with `period_d`, NaN where none is given; `maximum_jd` is a time of its
     largest light, which a user's table may have. `multiple` is its flag H59 of doubles (C resolved,
     G accelerated, O orbit, V variability-induced, X unexplained scatter), with `separation_arcsec`
-    where it resolved the pair:
-    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts
-    all rows of the source, and `notes` say what became of them.
+    where it resolved the pair: V and the colours are then those of both, except for 472 of 11 101
+    entries. `rows_read` counts all rows of the source, and `notes` say what became of them.
     """
 
     hip: npt.NDArray[np.int32]

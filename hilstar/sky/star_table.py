@@ -483,8 +483,8 @@ def join(hipparcos: Catalog, table: Catalog) -> Joined:
     """Add the table's stars that Hipparcos does not have.
 
     Stars are compared at the median epoch of the table's places. Hipparcos' own row stays for each
-    star of both, with
-    its place, magnitude and number; so do pairs that it has as one star of the sum.
+    star of both, with its place, magnitude and number; so do pairs that it has as one star of the
+    sum.
     """
     epoch_jyear = float(np.median(table.epoch_jyear))
     owner, arcsec = _nearest_owner(hipparcos, table, epoch_jyear)

@@ -36,8 +36,7 @@ DEFAULT_PITCH_UM = 13.0  # the CCD47-20's
 MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
 # A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a
-# pair. The mean
-# alone, without Landau's tail.
+# pair. The mean alone, without Landau's tail.
 RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
 RAY_STEP_PX = 0.25  # along a track, so that no pixel that it crosses is passed over
@@ -58,8 +57,8 @@ def cosmic_rays_e(
     silicon.
 
     The rate is that of hits on the sensor's face. Rays come isotropically, so a face sees cos^2 of
-    the angle to its
-    normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS are expected.
+    the angle to its normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS
+    are expected.
     """
     height, width = shape
     area_cm2 = width * height * (pixel_pitch_um * 1e-4) ** 2
@@ -170,8 +169,7 @@ class Detector:
         in the exposure.
 
         Raises InputError for a wrong shape, and for electrons or an exposure that are negative, not
-        finite or beyond
-        MAX_E.
+        finite or beyond MAX_E.
         """
         settings = self.settings
         light_e = self.collected_e(mean_e, exposure_s)

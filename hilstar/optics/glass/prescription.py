@@ -1,11 +1,11 @@
 """A glass from a lens's prescription: optiland traces it, and its rays become PSFs with
 diffraction.
 
-Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k
-(path + L (x - x_ray) +
-M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the
-angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would need too many rays,
-because what diffraction spreads is far finer than the aberrations, rays are counted as they fall.
+Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k (path
++ L (x - x_ray) + M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid
+angle of each (the angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would
+need too many rays, because what diffraction spreads is far finer than the aberrations, rays are
+counted as they fall.
 
 Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its
 middle on the chief ray of the field's middle, its axes the surface's own.

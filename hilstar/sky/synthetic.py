@@ -119,13 +119,13 @@ def _band(
         return np.asarray(np.log(mean / v_mean / zero), dtype=np.float64)
 
     low_k, high_k = electrons.TABLE_RANGE_K
-    table = Chebyshev.interpolate(
-        log_mean, electrons.TABLE_DEGREE, domain=[1.0 / high_k, 1.0 / low_k]
-    )
+    inverse_range = [1.0 / high_k, 1.0 / low_k]
+    table = Chebyshev.interpolate(log_mean, electrons.TABLE_DEGREE, domain=inverse_range)
 
     def colour(bv_mag: FloatArray, _vi: FloatArray, _kind: FloatArray | None) -> FloatArray:
         kelvin = electrons.star_temperatures_k(bv_mag, temperature)
-        return magnitude(np.exp(table(1.0 / kelvin)))
+        relative: FloatArray = np.exp(table(1.0 / kelvin))
+        return magnitude(relative)
 
     return colour
 

@@ -34,6 +34,7 @@ NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild le
 # In focal lengths, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10,
 # which is enough.
 NEWTON_DONE = 1e-13
+# tangents to either side of a direction, for its slopes; Newton's last step is under it
 SLOPE_STEP = 1e-6
 BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens
 WITHIN = 1 - 1e-12  # the lens, whatever rounding does

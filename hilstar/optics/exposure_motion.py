@@ -40,12 +40,12 @@ MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
 # farther apart.
 MAX_PIECES = 20_000
 MAX_SPRITES = 2_000_000
-COARSER = 0.25
-MIN_COARSENESS = COARSER**3
+COARSER = 0.25  # of the nodes to a sigma, from one attempt to the next
+MIN_COARSENESS = COARSER**3  # after it a turn has too many sprites
 MIDDLE_S = np.zeros(1)
 AT_ONCE = Scan()
 MAX_ROWS_A_ROW = 0.5  # rows that a star may cross while one is read
-ROUNDS, SETTLED_S = 40, 1e-10
+ROUNDS, SETTLED_S = 40, 1e-10  # a round leaves up to MAX_ROWS_A_ROW of the error: 40 leave 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,9 @@ def smeared_sprites(
 
 @dataclass(frozen=True, slots=True)
 class _Smear:
-    """Stars smeared on one image."""
+    """How stars are smeared on an image: its camera and PSF, the nodes to a sigma of their paths,
+    and how its rows are exposed.
+    """
 
     stars: Stars
     camera: Camera

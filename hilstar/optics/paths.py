@@ -198,15 +198,15 @@ class Paths:
 
 @dataclass(frozen=True, slots=True)
 class Chords:
-    """The straight ways between the ends of n paths, px, (2, n) each: begin and end; NaN behind
-    the camera.
+    """Straight ways between the ends of n paths, px: x and y (2, n), begin and end; NaN behind the
+    camera.
     """
 
     x_px: FloatArray
     y_px: FloatArray
 
     def to(self, longer: FloatArray) -> "Chords":
-        """The same ways from their begins, so many times (n,) as long."""
+        """The chords with the same begins, each so many times (n,) as long."""
         x_begin, x_end = self.x_px
         y_begin, y_end = self.y_px
         x_px = np.stack([x_begin, x_begin + (x_end - x_begin) * longer])
@@ -274,12 +274,12 @@ def node_counts(
 
 
 class ShortPaths:
-    """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of
-    its places as `points`.
+    """Paths (n) that approximate those of `exact`, each within `half_s` of its own `middle_s` (n,):
+    polynomials through `points` of its places.
 
-    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature
-    are the path's too.
-    Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
+    The places are at the roots of a Chebyshev polynomial. With one point, slope and curvature of
+    the path come from a table of the lens. Paths are off by at most LIMIT_PX or LIMIT_SHARE where
+    `points_within` gave the number of points.
     """
 
     def __init__(self, exact: Paths, middle_s: FloatArray, half_s: float, points: int) -> None:
@@ -321,11 +321,11 @@ class ShortPaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensTable:
-    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over
-    its box.
+    """Where a lens images tangents: a polynomial of second degree about each node of a grid over
+    the lens's box.
 
-    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and
-    vv / 2. On the image places are off by up to `off_px`.
+    `terms` (6, 2, nodes) are x and y, px: the place, its changes by a step along u and v, and its
+    bends by uu / 2, uv and vv / 2. On the image places are off by up to `off_px`.
     """
 
     first: FloatArray
@@ -412,8 +412,8 @@ def _lens_table(
 
 
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
-    """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle;
-    None where no few do.
+    """The fewest places through which a path is within LIMIT_PX or LIMIT_SHARE of the exact one,
+    for a camera that turns by twice that angle; None where none are enough.
     """
     for points, longest_rad in _longest_half_turns_rad(*_mapping(camera)):
         if 0 < half_turn_rad <= longest_rad:
@@ -423,7 +423,9 @@ def points_within(camera: Camera, half_turn_rad: float) -> int | None:
 
 @lru_cache(maxsize=16)
 def bend_px(camera: Camera) -> float:
-    """The farthest that a lens moves a direction from where a pinhole has it, on the image."""
+    """The largest distance on the image between where a lens and where a pinhole of its focal
+    length has a direction, px.
+    """
     if camera.lens is None:
         return 0.0
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
@@ -455,8 +457,8 @@ def _longest_half_turns_rad(
 
 
 def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
-    """The largest error on the image, about several axes, as a multiple of what it may be: of
-    paths that begin on the image.
+    """The largest error of short paths that begin on the image, as a multiple of what is allowed,
+    over turns about TRIED_AXES.
     """
     camera = _beyond(camera)
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))

@@ -25,10 +25,9 @@ from hilstar.basics.image_files import ImageSizeError, opened_fits
 from hilstar.basics.reading import named_bytes
 
 # The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would
-# be enough for the
-# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the
-# cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a
-# tenth and cut 4e-5 mag.
+# be enough for the flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of
+# that is cut, at the cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the
+# front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 MAX_GAUSSIAN_PX = 100_000  # the largest footprint that is tried
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
@@ -37,6 +36,7 @@ SQRT2 = math.sqrt(2.0)
 # 4.4e-7 off.
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
+# distances that the polynomial is fitted to; rounds of Lawson's weights
 FIT_PLACES, FIT_ROUNDS = 120, 15
 BOUND_PLACES = 200  # along an axis, at which an upper bound is taken
 # The rational approximation of erf in shaders/shares.glsl, above and below the line, the highest
@@ -92,8 +92,8 @@ FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in it
 
 
 class ShareShader(NamedTuple):
-    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w,
-    channels).
+    """What shares.glsl needs of a PSF: lines to define before it, its uniforms by name, and its
+    table (h, w, channels), if it has one.
     """
 
     defines: tuple[str, ...]
@@ -102,10 +102,11 @@ class ShareShader(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far a share of light may lie from its star: an ellipse.
+    """The ellipse about a star within which a pixel of its footprint can get more than a share s of
+    its light.
 
-    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 /
-    `axes_px2[1]` under log(`factor` / s).
+    It is x^2 / `axes_px2[0]` + y^2 / `axes_px2[1]` < log(`factor` / s), with x and y from the star,
+    px.
     """
 
     axes_px2: tuple[float, float]
@@ -118,9 +119,8 @@ class Psf(ABC):
 
     `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum. One
     that does has an odd footprint and overrides `stamps_at`, `image` and `centroids_px`: those who
-    draw ask these.
-    A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths, or (n, L) of n
-    stars; `mean_shares` (L,) are those of light without a spectrum of its own.
+    draw ask these. A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths,
+    or (n, L) of n stars; `mean_shares` (L,) are those of light without a spectrum of its own.
     """
 
     by_place = False
@@ -323,7 +323,7 @@ class GaussianPsf(Psf):
     def stamps(
         self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
     ) -> Float32Array:
-        """Row by row the product of what each column and each row has."""
+        """See `Psf.stamps`: the share of each column times the share of each row."""
         from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
         edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
@@ -366,7 +366,7 @@ class GaussianPsf(Psf):
         return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """Axis by axis, from the complements of both edges."""
+        """See `Psf.cut_share`: axis by axis, from the complements of both edges."""
         inside = 1.0
         for sigma in self.sigma_px:
             beyond_near = math.erfc((size_px / 2 - 0.5) / (sigma * SQRT2))
@@ -375,7 +375,7 @@ class GaussianPsf(Psf):
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
-        """The share of a pixel beside the middle of an edge."""
+        """See `Psf.outside_share`: that of a pixel beside the middle of an edge."""
         sigma_x, sigma_y = self.sigma_px
         beyond_px = size_px / 2
         beside_x = pixel_share(beyond_px, sigma_x) * pixel_share(0.0, sigma_y)
@@ -619,7 +619,9 @@ class SampledPsf(Psf):
         return image.astype(np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """The largest of the four corners' of a pixel, by the shares at half pixels."""
+        """See `Psf.cut_share`: the largest for stars on the four corners of a pixel, by the shares
+        at half pixels.
+        """
         first = len(self._halves) // 2 - size_px
         if first < 0:
             return 0.0
@@ -632,15 +634,15 @@ class SampledPsf(Psf):
         return 1 - least
 
     def outside_share(self, size_px: int) -> float:
-        """The largest of the table beyond half of that side."""
+        """See `Psf.outside_share`: the largest share of the table beyond half of that side."""
         from_middle = np.abs(np.arange(len(self._table)) - len(self._table) // 2)
         far = from_middle >= size_px * self._steps / 2
         largest = max(self._table[far].max(initial=1e-30), self._table[:, far].max(initial=1e-30))
         return float(largest)
 
     def shader(self, side_px: int) -> ShareShader:
-        """The same table: in each cell between four places what its bilinear interpolation is
-        made of.
+        """See `Psf.shader`: the table by cells of its grid, each with its four coefficients of
+        bilinear interpolation.
         """
         near = self._table[:-1, :-1]
         right = self._table[:-1, 1:]
@@ -699,10 +701,11 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
 
 
 def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
-    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and
-    the PSF of each.
+    """Gaussians that together stand for the light of an evenly lit square: their places along its
+    side, in sides from its middle, and the PSF of each.
 
-    The PSF is `psf` with what the points lack of the square's variance; `side_px` is in its pixels.
+    The PSF is `psf`, widened by the variance of the square that the places lack; `side_px` is in
+    its pixels.
     """
     narrow_px = min(psf.width_px)
     if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:

@@ -20,14 +20,14 @@ NODES = 9  # of a quadrature over a pixel and a square, along each axis
 NODES_FROM = ((2.0, 3), (0.7, 5), (0.0, NODES))
 SIDE_STEPS = 600  # of the weight of a pixel convolved with a square's side
 MIN_VARIANCE_PX2 = 0.15**2
-MAX_CORRELATION = 0.95
+MAX_CORRELATION = 0.95  # a Gaussian of 1 is a line, whose density has no bound
 FIT_ROUNDS = 8
 MAX_STEP_PX, MAX_STEP_SHARE = 0.3, 0.6  # of a place, and of a variance, in one round
 RIDGE = 1e-9  # on unit columns: two that are alike share the light
 # residuals of more than so many medians count less, anew in each round
 FIELD_ROUNDS, OUTLIER_MEDIANS = 5, 2.0
-SMALLEST = 1e-300
-XX, YY, XY = 0, 1, 2
+SMALLEST = 1e-300  # in place of 0 where a column or a flux is divided by
+XX, YY, XY = 0, 1, 2  # columns of a covariance (n, 3)
 
 
 @lru_cache(maxsize=1024)
@@ -154,7 +154,9 @@ class PixelGaussians:
 
 
 def bounded(covariance: FloatArray) -> FloatArray:
-    """Covariances (n, 3) that are some: variances not under the smallest, and no line."""
+    """Covariances (n, 3), px^2, kept to those of a Gaussian: variances of MIN_VARIANCE_PX2 or more,
+    a correlation of up to MAX_CORRELATION.
+    """
     xx, yy = np.maximum(covariance[:, :XY], MIN_VARIANCE_PX2).T
     most = MAX_CORRELATION * np.sqrt(xx * yy)
     return np.stack([xx, yy, np.clip(covariance[:, XY], -most, most)], axis=1)
@@ -173,7 +175,9 @@ def normal_equations(
 
 
 def amplitudes(columns: Sequence[FloatArray], weight: FloatArray, images: FloatArray) -> FloatArray:
-    """How much (n, c) of each column (n, h, w) images (n, h, w) have, by weighted least squares."""
+    """The factors (n, c) by which columns (n, h, w) add up to images (n, h, w), by weighted least
+    squares.
+    """
     count = len(images)
     flat = np.stack(columns, axis=1).reshape(count, len(columns), -1)
     normal, right = normal_equations(flat, weight.reshape(count, -1), images.reshape(count, -1))

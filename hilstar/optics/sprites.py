@@ -76,24 +76,21 @@ class Candidates:
         keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
-            same = (
+            same_stars = (
                 stars.vectors is last.vectors
                 and stars.electrons_per_s is last.electrons_per_s
                 and stars.grid is last.grid
             )
+            same_image = camera is last_camera and margin_px == last_margin_px
             difference = (icrs_to_image - last_icrs_to_image).ravel()
             # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from
             # R to S: roll counts as well.
             chord = math.sqrt(float(difference @ difference) / 8)
             turned_rad = 2 * math.asin(min(1.0, chord))
-            if (
-                same
-                and camera is last_camera
-                and margin_px == last_margin_px
-                and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD
-            ):
+            if same_stars and same_image and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
                 return near
-        star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
+        reach_rad = KEPT_TURN_RAD if keeps else 0.0
+        star = stars_about(stars, icrs_to_image, camera, margin_px, reach_rad)
         near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
         if keeps:
             self._kept = stars, camera, margin_px, icrs_to_image.copy(), near
@@ -131,15 +128,14 @@ class FrameLight:
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1)
     // 2`. A star's light is divided among up to `per_star` sprites. `capped` stars are drawn
-    coarser than they should be, or not at all, because
-    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as
-    paths, None for points. `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that
-    changes over the field; None draws all by its mean. `extended` is the frame's light other than
-    stars, in the order in which it is drawn; `discs` names the bodies among it, and `over_white`
-    those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for
-    `star`.
-    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each,
-    and `lights` the extended light of each, moved to where that primary has to be drawn.
+    coarser than they should be, or not at all, because the work of a frame is bounded.
+    `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
+    `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field;
+    None draws all by its mean. `extended` is the frame's light other than stars, in the order in
+    which it is drawn; `discs` names the bodies among it, and `over_white` those of them that are
+    brighter than white. Sprites of `added` light have -1, -2 and on for `star`. Where the monitor's
+    primaries are driven apart, `primaries` float32 (n, 3) is the light of each, and `lights` the
+    extended light of each, moved to where that primary has to be drawn.
     """
 
     data: npt.NDArray[np.void]

@@ -27,7 +27,7 @@ W_M2_SR_M = 1e-8 * 1e6  # table 17's unit, 1e-8 W m-2 sr-1 um-1
 NEAR_DEG, FAR_DEG = 30.0, 90.0
 NEAR_SLOPES, FAR_SLOPES = (1.2, 0.8), (0.9, 0.6)
 J2000_JD = 2_451_545.0
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # of corners' shares: a blank corner with less has no part in a direction
 
 
 class Sunward(NamedTuple):

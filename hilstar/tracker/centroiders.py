@@ -21,16 +21,16 @@ Centroider = Literal[Kind, "psf"]  # which is `fit` where a star is a Gaussian
 FAMILY: tuple[Kind, ...] = get_args(Kind)
 WIDE = 1.5  # in units of the star's sigma
 MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
-FIT_STEPS, WINDOW_STEPS = 8, 20
+FIT_STEPS, WINDOW_STEPS = 8, 20  # at most: stars that have settled end them before
 FIRST_STEPS = 3  # steps with a window before a fit
 # A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both
 # come to rest by this.
 PACE = 1.5
-SETTLED_PX = 1e-6
+SETTLED_PX = 1e-6  # a step under it moves no star any more
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02  # of its brightest pixel: darker ones do not count in a box
 BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}
-MIN_LIGHT = 1e-30
+MIN_LIGHT = 1e-30  # a square with less is dark
 SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
 
 
@@ -127,6 +127,7 @@ def _axis(stamps: FloatArray) -> FloatArray:
 
 
 def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
+    """See the module: places (n,) by the plain first moment."""
     at = _axis(stamps)
     light = stamps.sum(axis=(1, 2))
     x = stamps.sum(axis=1) @ at / light
@@ -142,6 +143,9 @@ def _window(
     wide: float = 1.0,
     steps: int = WINDOW_STEPS,
 ) -> Places:
+    """See the module: places (n,) by a Gaussian window, `wide` times as wide as the star, that
+    follows it.
+    """
     at = _axis(stamps)
     x, y = _box(stamps, 2, pixels)
     sigma_x, sigma_y = (wide * max(sigma, MIN_WINDOW_PX) for sigma in sigma_px)
@@ -169,6 +173,7 @@ def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
 
 
 def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
+    """See the module: places (n,) by least squares of a Gaussian, after some steps of a window."""
     at = _axis(stamps)
     x, y = _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
     sigma_x, sigma_y = sigma_px
@@ -238,6 +243,9 @@ def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> Places:
 
 
 def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE) -> Places:
+    """See the module: places (n,) by the centre of mass of boxes that reach `half` pixels from
+    `pixels`.
+    """
     rows, columns = pixels
     side = stamps.shape[1]
     near = np.arange(-half, half + 1)

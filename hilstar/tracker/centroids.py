@@ -38,8 +38,7 @@ CLIPPED_SIGMA = 0.986578
 MIN_STEP_PX = 1e-7
 WITH_DIAGONALS = np.ones((3, 3), dtype=np.bool_)
 # Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10
-# times the
-# plain one, so that noise in the moment cannot throw the centre out of the window.
+# times the plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
 COUNTED_TYPES, COUNTED_AT_ONCE = (np.uint8, np.uint16), 1 << 16
 # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to
@@ -64,8 +63,7 @@ class CentroidSettings:
 
     `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2
     radius + 1 pixels wide. `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian
-    star from the places.
-    Raises InputError for a value out of range.
+    star from the places. Raises InputError for a value out of range.
     """
 
     threshold_sigma: float = 5.0
@@ -111,9 +109,8 @@ class Centroids:
     right, y down.
 
     `flux` is the sum in the window, `peak` the highest pixel of the blob, both above the background
-    and in the image's
-    unit; `pixels` counts the blob; `at_edge` says that the window leaves the image, which biases
-    the place inwards.
+    and in the image's unit; `pixels` counts the blob; `at_edge` says that the window leaves the
+    image, which biases the place inwards.
     """
 
     x_px: FloatArray
@@ -144,11 +141,10 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     sigma of the median.
 
     The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One
-    level for the image:
-    a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole
-    numbers, else 0), and the noise at least rounding's, step / sqrt 12. That of a noiseless float
-    image is 0, and then every pixel over the level belongs to a star: give a `LocalBackground` for
-    such an image.
+    level for the image: a gradient counts as noise. `step` is what the image was rounded to
+    (default: 1 for whole numbers, else 0), and the noise at least rounding's, step / sqrt 12. That
+    of a noiseless float image is 0, and then every pixel over the level belongs to a star: give a
+    `LocalBackground` for such an image.
     """
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
@@ -245,8 +241,7 @@ def find_stars(
     or another shape.
 
     Without `background` it is estimated from the image. Stars whose blobs touch are one; a
-    neighbour inside the window
-    pulls the centre towards itself.
+    neighbour inside the window pulls the centre towards itself.
     """
     settings = settings or CentroidSettings()
     _check(image)
@@ -436,9 +431,8 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     itself.
 
     Window and star are products of an x and a y part, so the curve of one axis does not depend on
-    the other's place.
-    Raises InputError where two places within a pixel are measured as one: the window is too narrow
-    for that star.
+    the other's place. Raises InputError where two places within a pixel are measured as one: the
+    window is too narrow for that star.
     """
     if settings.psf_sigma_px is None:
         raise InputError(

@@ -25,8 +25,8 @@ E2V_DARK = {"ccd47-20": (1.14e6, 9080.0), "e2v-nimo": (122.0, 6400.0)}
 DATASHEET_RANGE_K = (230.0, 300.0)
 
 # More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their
-# rounding is 0.004
-# at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
+# rounding is 0.004 at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails
+# (9.2e18).
 MAX_E = 1e12
 
 Amount = Annotated[float, Meta(ge=0, le=MAX_E)]

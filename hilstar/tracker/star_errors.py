@@ -31,7 +31,7 @@ BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centr
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
 GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
-MIN_BLUR_PX = 1e-3
+MIN_BLUR_PX = 1e-3  # in place of none, by which places would be divided
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class StarErrors:
         return float(np.hypot(*self.off_px[kind]).max())
 
     def worst(self) -> Centroider:
-        """Who is furthest off."""
+        """The centroider with the largest distance."""
         return max(self.off_px, key=self.max_px)
 
 
@@ -73,14 +73,14 @@ def _rms(errors: FloatArray) -> float:
 
 
 class Judge:
-    """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where
-    they should be.
+    """A tracker that measures the stars in the tiles of an image against the same stars in the
+    image that is wanted.
 
-    `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a
-    column of tiles at an
-    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in
-    monitor pixels, and `box_share` the threshold of its boxes. `phases` (count,) along x and y say
-    where in a tracker's pixel the stars of a column and of a row are, by default anywhere.
+    `wanted` (count * tile, count * tile) has one star near the middle of each tile: those of a
+    column of tiles at one x of `places_px`, those of a row at one y (count,). `sigma_px` (x, y) is
+    a star's; `blur_px` and `pixel_px` are the tracker's; all in monitor pixels. `box_share` is the
+    threshold of its boxes. `phases` (count,) along x and y say where in a tracker's pixel the stars
+    of a column and of a row are; by default they are spread evenly.
     """
 
     def __init__(
@@ -132,7 +132,9 @@ class Judge:
         return StarErrors(np.asarray(magnitude(flux_ratio)), off_px)
 
     def _places_of(self, image: FloatArray, kind: Centroider) -> FloatArray:
-        """The stars' places (2, n), px, from where the tracker's pixel in the middle is."""
+        """The places (2, n), px, at which a centroider finds the stars, from the tracker's pixel in
+        the middle.
+        """
         if kind == "moment":  # no blur and no pixel changes it
             tiles = self._tiles(image, self._tile)
             at = np.arange(self._tile)

@@ -217,9 +217,9 @@ class CommonChange:
     """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes
     (positive: too faint).
 
-    A figure is 0 where the stars do not have it in common.
-    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image
-    has. Stars that the shift brought into view or took out of it are in neither.
+    A figure is 0 where the stars do not have it in common. `beyond` are the stars of both images
+    once that is subtracted, `alone` those that only one image has. Stars that the shift brought
+    into view or took out of it are in neither.
     """
 
     shift_px: tuple[float, float]

@@ -47,6 +47,7 @@ class HeadsErrors:
 
 
 def _figures(errors: list[float]) -> dict[str, float] | None:
+    """The rms and the maximum of errors, None without any."""
     if not errors:
         return None
     rms = np.sqrt(np.mean(np.square(errors)))

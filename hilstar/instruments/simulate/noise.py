@@ -52,7 +52,7 @@ from hilstar.tracker.mosaic import (
 from hilstar.tracker.settings import DetectorSettings, PixelNoise
 
 PHASES = 6  # along a side of a pixel
-SLOPE_STEP_PX = 1e-3
+SLOPE_STEP_PX = 1e-3  # to either side of a place, for slopes
 CHUNK = 64  # stars at once
 UNSEEN = 0.01  # the probability of detection at which the table of magnitudes ends
 MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars are interpolated
@@ -60,9 +60,9 @@ MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars
 NO_INFORMATION = NO_NOISE_E2 = 1e-12
 # simulated stars of a magnitude along a side of an image; found ones that give an error
 TRIALS, MIN_FOUND = 20, 40
-SKY_FIELDS = 100
+SKY_FIELDS = 100  # at random, of which medians are told
 LIMIT_STEP_MAG = 0.25
-TURN_RAD = 1e-6
+TURN_RAD = 1e-6  # about each axis, for its slopes: 0.2 arcsec
 NO_PLACE_PX = 1e3  # a star whose light never leaves one pixel, or is all clipped
 MIN_STARS = 2  # for an attitude
 # A pattern of four stars is what lost-in-space solvers look up (tetra3's and astrometry.net's).

@@ -42,12 +42,13 @@ MAX_STEPS, MIN_STEPS, TABLE_SIDE, PLACES_A_PX = 4, 2, 1024, 32
 # What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids
 # and second moments are kept.
 STAMP_TOLERANCE = 3e-4
-FIRST_STAMPS, MAX_STAMPS = 48, 400
+FIRST_STAMPS, MAX_STAMPS = 48, 400  # the first number that is tried, doubled up to the last
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
-MAX_GRID_DEGREE = 4
-ON_EDGE_PX = 1e-6
+MAX_GRID_DEGREE = 4  # of splines over a full grid
+ON_EDGE_PX = 1e-6  # of the field's scale: rounding, by which a point on the hull is outside it
 SMALLEST, DARK = 1e-15, 1e-12  # numbers, and illuminations, that count as none
-SPRITES_AT_ONCE_PX = 2_000_000
+SPRITES_AT_ONCE_PX = 2_000_000  # bounds the memory: their stamps take 8 MB
+# samples to a pixel; rounds in which a weight becomes as wide as a PSF
 MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
 # basis images of the simpler glasses that may stand for one
 COMPONENTS = (3, 6, 12)
@@ -57,9 +58,10 @@ Kernel = Literal["linear", "thin_plate_spline", "quintic"]
 
 
 class NodeSpline:
-    """Functions of one variable, one of each of `nodes` (k,), rising: 1 there, 0 at the others.
+    """Interpolation in one variable: for each of its `nodes` (k,), which rise, a function that is 1
+    at that node and 0 at the others.
 
-    Beyond the nodes the values at their ends count.
+    Beyond the first and the last node the functions keep their values there.
     """
 
     def __init__(self, nodes: FloatArray, max_degree: int = MAX_DEGREE) -> None:
@@ -89,11 +91,12 @@ class NodeSpline:
 
 
 class Field:
-    """Functions over the field, one of each of its points (F, 2): 1 there, 0 at the others, smooth
-    between.
+    """Interpolation over the field: for each of its points (F, 2), px, a smooth function that is 1
+    at that point and 0 at the others.
 
-    On a full grid they are products of splines, elsewhere radial basis functions with polynomials.
-    Beyond the points' convex hull they have the values of its nearest place.
+    On a full grid the functions are products of splines, elsewhere radial basis functions with
+    polynomials. Beyond the points' convex hull they keep the values at the nearest place of its
+    edge.
     """
 
     def __init__(self, places_px: FloatArray) -> None:
@@ -195,12 +198,13 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class _Stamps:
-    """Stamps, images of the light of pixels, from which PSFs are mixed: `stamps` (R, side^2).
+    """Images of the light of pixels, `stamps` (R, side^2), of which every star's image is a
+    weighted sum.
 
-    The coefficient of a stamp is a polynomial of a star's place within its pixel. `parts` (squares,
-    6 K, R) are the polynomials' coefficients for each basis image and each square of a pixel, in
-    the order of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light of pixels
-    by basis image at all tabulated places.
+    The weight of a stamp is a quadratic function of the star's place within its pixel, by squares
+    of the pixel. `parts` (squares, 6 K, R) are its coefficients for each basis image, in the order
+    of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light that pixels get of
+    each basis image at all tabulated places.
     """
 
     stamps: Float32Array
@@ -225,15 +229,17 @@ class Focused:
 
 
 class _Measured(SampledPsf):
-    """An image whose width is wanted, and which no star is drawn by."""
+    """An image of which only the width is asked for. No star is drawn by it, so negative light is
+    no fault.
+    """
 
     max_negative = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class GlassPsf(SampledPsf):
-    """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in
-    the field's middle.
+    """A glass at one focus. Each star is drawn by its place and its spectrum, all other light by
+    the mean PSF in the middle of the field.
 
     `mean_shares` (L,) are the shares that each wavelength has of light without a spectrum of its
     own. Make it with `glass_psf`.
@@ -303,7 +309,9 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def peak_share(self) -> float:
-        """The largest of the sharpest PSF, where a star is in a pixel's middle, and of the mean."""
+        """The largest share that one pixel gets: of the sharpest PSF, for a star in the middle of a
+        pixel, or of the mean PSF at any place.
+        """
         return max(float(self._table.max()), float(self._centred().max()))
 
     def _centred(self) -> Float32Array:
@@ -383,8 +391,8 @@ class GlassPsf(SampledPsf):
         return _Stamps(stamps, by_square, stamps.sum(axis=1), light)
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
-        """How much stars at places (n,) have of each basis image (n, K); `shares` as
-        spectra of `Psf`.
+        """The weights (n, K) of the basis images in the light of stars at places (n,); `shares` are
+        spectra as in `Psf`.
         """
         by_field = self.field(x_px, y_px).T.astype(np.float32)
         shares = shares.T.astype(np.float32, order="C")
@@ -399,8 +407,8 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def _light(self) -> Float32Array:
-        """The weights of each point's and wavelength's light (F L, K): a PSF's, times its
-        illumination inside the image.
+        """The weights (F L, K) of the basis images in the light of each field point and wavelength:
+        those of its PSF, times its illumination inside the image.
         """
         optics = self.optics
         light = optics.weights * (optics.illumination * optics.inside)[..., None]
@@ -490,8 +498,8 @@ class GlassPsf(SampledPsf):
         return parts @ self._stamps.stamps, np.asarray(scale, dtype=np.float32)
 
     def unreduced(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
-        """The same of stars of 1 electron per second, by the whole basis: exact, and some
-        hundred times as slow.
+        """The light (n, side, side) about stars of 1 electron per second by the whole basis: what
+        `_drawn` approximates, exact and some hundred times as slow.
         """
         side = self.footprint_px
         at_px = np.arange(side) - side // 2
@@ -713,10 +721,10 @@ def _of_images(psf: GlassPsf, images: FloatArray, weights: FloatArray) -> GlassP
 
 
 def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
-    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus
-    needs fewer components.
+    """A glass whose PSFs are moved by `lateral` (F, L, 2) samples, right and down, on a basis made
+    for its one focus, which needs fewer components.
 
-    Pixels have `width` samples, 1 where they are integrated.
+    A pixel has `width` samples; 1 where pixels are integrated.
     """
     from scipy.ndimage import shift
 
@@ -784,11 +792,11 @@ def _normal_floats(values: FloatArray) -> Float32Array:
 
 
 def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
-    """Rows (R, side^2), and the coefficients (n, R) by which they make those of a table to
+    """Few rows (R, side^2) and coefficients (n, R), whose product is the table (n, side^2) to
     STAMP_TOLERANCE.
 
     Flux, centroids and second moments are kept exactly. Random projections find the principal
-    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same.
+    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same ones.
     """
     carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
     moments = table @ terms

@@ -1,11 +1,11 @@
 """A glass from a lens's prescription: optiland traces it, and its rays become PSFs with
 diffraction.
 
-Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k
-(path + L (x - x_ray) +
-M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the
-angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would need too many rays,
-because what diffraction spreads is far finer than the aberrations, rays are counted as they fall.
+Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k (path
++ L (x - x_ray) + M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid
+angle of each (the angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would
+need too many rays, because what diffraction spreads is far finer than the aberrations, rays are
+counted as they fall.
 
 Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its
 middle on the chief ray of the field's middle, its axes the surface's own.
@@ -50,6 +50,7 @@ MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does n
 # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
 PERIOD_MARGIN = 2.0
 FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
+# Newton's rounds from a place to its field; distortion is fitted to rays along spokes of the field
 CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
 EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
 MIN_LIT = 1e-3  # share of a pupil below which a field point is dark
@@ -574,7 +575,7 @@ class _Chiefs:
     lens: Lens | None
 
     def places_mm(self, tangents: FloatArray) -> FloatArray:
-        """Where it has directions (n, 2)."""
+        """Places (n, 2), mm from the detector's middle, of directions (n, 2) by their tangents."""
         if self.lens is None:
             return np.asarray(self.focal_length_mm * tangents)
         u, v = self.lens.bent(*tangents.T)

@@ -349,7 +349,7 @@ def _check_psfs(glass: Glass) -> None:
 
 
 def _binned(image: Float32Array, per_px: int) -> FloatArray:
-    """Sums over about a pixel each."""
+    """An image's sums over squares of about a pixel."""
     height, width = image.shape
     first_rows = np.arange(0, height, per_px)
     first_columns = np.arange(0, width, per_px)

@@ -22,14 +22,14 @@ from hilstar.optics.sprites import FrameLight
 from hilstar.sky.diffuse import TangentImage
 from hilstar.sky.stars import Stars
 
-CELL_PX = 16
-ON_EDGE_PX = 0.01
+CELL_PX = 16  # side of cells: places are computed at their corners, and linear between these
+ON_EDGE_PX = 0.01  # of a tangent image: two faces of a cube both hold their common edge
 MOVED_PX = 0.25  # at most, by taking one attitude for a cell of them
 
 
 class DiffuseLayer:
-    """The light of tangent images in electrons/s/sr; of a monitor only cells that pass its first
-    step in a pixel.
+    """Diffuse light of the sky, from tangent images in electrons/s/sr. A monitor is given only the
+    cells of its image in which a pixel passes its first step.
     """
 
     def __init__(self, images: tuple[TangentImage, ...], canvas: Canvas) -> None:
@@ -68,8 +68,8 @@ class DiffuseLayer:
         self._kept: tuple[FloatArray, tuple[LightMap, ...]] | None = None
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
-        """The light before, and the map's; a screen's is that of its attitude's cell, and the
-        same objects within a cell.
+        """The light before, and the map's. On a screen that is the map of the attitude's cell:
+        within a cell it is the same objects, which are uploaded once.
         """
         cell = view.q_icrs_to_cam
         if self._cell_q:
@@ -174,8 +174,8 @@ def _first_pixels(first_cell: int, cells: int, size_px: int, corners: int) -> In
 
 @dataclass(slots=True)
 class _Part:
-    """A rectangle of an image: its first pixel, its cells' corners, their shares in its rows and
-    columns, which are its own.
+    """A rectangle of an image: its first pixel (x, y), the corners of its cells, the shares of
+    these corners in its rows and columns, and which pixels are its own.
     """
 
     corner_px: tuple[int, int]
@@ -190,8 +190,8 @@ class _Part:
         return np.asarray(self.down @ corners @ self.across.T)
 
     def keep(self, held: BoolArray, taken: BoolArray) -> None:
-        """Leave pixels that are not `held` here or `taken` before, and take the others, in an
-        image's `taken` (h, w).
+        """Give up the pixels that are not `held` or that another face has in `taken` (h, w), and
+        note the others there.
         """
         left, top = self.corner_px
         rows, columns = self.own.shape
@@ -201,10 +201,11 @@ class _Part:
 
 
 class _Face:
-    """A tangent image, and the most light that any place has within a cell of it.
+    """A tangent image prepared for a camera: `most` is the largest light within a cell of any
+    place.
 
-    What has more light than `least` is within a radius of the direction `middle` (3,), ICRS, cells
-    that touch it included.
+    All that has more light than `least` is within a radius of the direction `middle` (3,), ICRS,
+    with the cells that it touches.
     """
 
     def __init__(self, image: TangentImage, px_rad: float, least: float) -> None:
@@ -242,8 +243,8 @@ class _Face:
         return np.where(inside, self.most[row, column], 0.0)
 
     def holds(self, x_px: Float32Array, y_px: Float32Array) -> BoolArray:
-        """Which places are not beyond its edge, or hardly: two faces both hold a place on their
-        edge.
+        """True for places within the face's edge, or hardly beyond it: two faces both hold a place
+        on their common edge.
         """
         half_px = self.image.max_tangent * self.image.px_per_tangent + ON_EDGE_PX
         across = np.abs(x_px - self.middle_px) <= half_px

@@ -15,12 +15,13 @@ class Field:
     zoom_hip: int | None = None
 
 
-FIELDS = (
+FIELDS: tuple[Field, ...] = (
     Field("orion", "Orion", (84.057, -1.200, 0.0), 26311),
     Field("lyra", "Lyra", (283.021, 35.349, 0.0), 92420),
     Field("rosetta", "zeta Cas before the Rosetta NAVCAM", (9.122, 53.817, 0.0), 2920),
 )
-ZETA_CAS = Field("zeta_cas", "zeta Cas", FIELDS[2].radec_roll_deg, FIELDS[2].zoom_hip)
+ROSETTA: Field = FIELDS[2]
+ZETA_CAS: Field = Field("zeta_cas", "zeta Cas", ROSETTA.radec_roll_deg, ROSETTA.zoom_hip)
 
 
 def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field, ...]:
@@ -29,7 +30,5 @@ def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field,
     if radec_roll_deg is None:
         return three
     ra_deg, dec_deg, roll_deg = radec_roll_deg
-    return (
-        *three,
-        Field(OWN, f"RA {ra_deg:g}, Dec {dec_deg:g}, roll {roll_deg:g}°", radec_roll_deg),
-    )
+    name = f"RA {ra_deg:g}, Dec {dec_deg:g}, roll {roll_deg:g}°"
+    return (*three, Field(OWN, name, radec_roll_deg))

@@ -16,7 +16,7 @@ import numpy as np
 
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, RED, SMALL_PT, capital, chart, two_digits, write_csv
+from hilstar.basics.charts import BLUE, RED, SMALL_PT, capital, chart, two_digits
 from hilstar.basics.rotation import (
     angle_between_rad,
     from_radec_roll_deg,
@@ -28,6 +28,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S, flux_ratio
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.assess.bench_effects import turn_between
 from hilstar.instruments.study import codes
+from hilstar.instruments.study.engine import write_rows
 from hilstar.instruments.study.predictors import ORION, predictors, rate_of, slew_attitude
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.optics.psf import GaussianPsf, pixel_shares
@@ -40,12 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # The demo's monitor and collimator (configs/demo.toml).
-FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX, ALIGNED = (
-    350.0,
-    57.65,
-    (1920, 1080),
-    np.array([1.0, 0.0, 0.0, 0.0]),
-)
+FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX = 350.0, 57.65, (1920, 1080)
+ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
 SIGMA_PX, REFRESH_HZ, PARTED_REFRESHES = 0.85, 60.0, 6.3
 FAINT_MAG, COARSE_BITS = 6.0, 8
 TOLERANCE_PX, TOLERANCE_MAG = RenderSettings().tolerance_px, RenderSettings().tolerance_mag
@@ -96,6 +93,19 @@ TOLERANCES: dict[Unit, float] = {
     "mag": TOLERANCE_MAG,
     "arcsec": TOLERANCE_ARCSEC,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class LimitRow:
+    """A method's error under one stress, its tolerance, and the stress at which they meet."""
+
+    method: str
+    stress: str
+    at: float
+    error: float
+    unit: Unit
+    tolerance: float
+    meets: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +161,14 @@ class Limit:
         if (self.error > self.tolerance).all():
             return "everywhere"
         return f"nowhere to {two_digits(float(self.at[-1]))} {self.at_unit}"
+
+    def rows(self) -> list[LimitRow]:
+        """Its rows of the table, from easy to hard."""
+        ends = self.unit, self.tolerance, self.meets
+        rows = []
+        for at, error in zip(self.at.tolist(), self.error.tolist(), strict=True):
+            rows.append(LimitRow(self.method, self.stress, at, error, *ends))
+        return rows
 
 
 def narrow_sprites() -> Limit:
@@ -375,19 +393,15 @@ def every_limit(quick: bool) -> list[Limit]:
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `limits.csv` and its chart; a line for each limit. Raises InputError."""
     limits = every_limit(quick)
-    rows = []
+    rows: list[LimitRow] = []
     for limit in limits:
-        ends = limit.unit, limit.tolerance, limit.meets
-        for at, error in zip(limit.at.tolist(), limit.error.tolist(), strict=True):
-            rows.append((limit.method, limit.stress, at, error, *ends))
-    write_csv(
-        directory / "limits.csv",
-        ("method", "stress", "at", "error", "unit", "tolerance", "meets"),
-        rows,
-    )
+        rows += limit.rows()
+    write_rows(directory / "limits.csv", rows)
     draw(directory / "limits", limits)
-    finding = limits_finding(limits)
-    return [finding, *(f"{limit.method} ({limit.stress}): {limit.words}" for limit in limits)]
+    lines = [limits_finding(limits)]
+    for limit in limits:
+        lines.append(f"{limit.method} ({limit.stress}): {limit.words}")
+    return lines
 
 
 def limits_finding(limits: Sequence[Limit]) -> str:
@@ -407,16 +421,8 @@ def draw(path: Path, limits: Sequence[Limit]) -> None:
         " px of the demo's monitor; the dot is where they meet. Each axis runs from easy to hard."
         " Places by the plain moment."
     )
-    height_inch = EDGE_INCH + PANEL_INCH * rows
-    with chart(
-        path,
-        limits_finding(limits),
-        rows,
-        COLUMNS,
-        note=note,
-        share_x=False,
-        height_inch=height_inch,
-    ) as grid:
+    layout: dict[str, Any] = {"share_x": False, "height_inch": EDGE_INCH + PANEL_INCH * rows}
+    with chart(path, limits_finding(limits), rows, COLUMNS, note=note, **layout) as grid:
         for axes, limit in zip(grid, limits, strict=False):
             draw_limit(axes, limit)
         for axes in grid[len(limits) :]:

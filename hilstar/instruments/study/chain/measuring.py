@@ -400,6 +400,13 @@ def times_of(taken: FloatArray) -> Times:
     return Times(time_ms, iqr_ms, noise_ms, cpu_ms, len(taken))
 
 
+def noise_ends_ms(time_ms: float, noise_ms: float) -> tuple[float, float]:
+    """The ends of the bar that a chart draws of a time's noise: on a logarithmic axis it reaches
+    at most to half of the time.
+    """
+    return max(time_ms - noise_ms, time_ms / 2), time_ms + noise_ms
+
+
 def rounded(value: float) -> float:
     """A figure with the tables' four digits."""
     if math.isfinite(value):

@@ -62,7 +62,7 @@ def test_the_limits_are_those_that_hilstar_tells_elsewhere(study):
         _, error, meets, tolerance = rows_of(rows, stress)
         assert math.isnan(meets) and (error < 1e-3 * tolerance).all()
     # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes
-    # (run/sync.py), to first order.
+    # (server/sync.py), to first order.
     at, error, _, _ = rows_of(rows, limits.TURN)
     per_deg_s = 3600 / 60 * 0.3 * 0.7 / 2 / 6.3
     assert error == pytest.approx(per_deg_s * at, rel=0.02)

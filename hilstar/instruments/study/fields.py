@@ -7,7 +7,9 @@ OWN = "field"
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field: stem of its files, name, place, and the star in the middle of the thesis's zoom."""
+    """A field: the stem of its files, its name and place, and the star in the middle of the
+    thesis's zoom.
+    """
 
     stem: str
     name: str
@@ -25,7 +27,9 @@ ZETA_CAS: Field = Field("zeta_cas", "zeta Cas", ROSETTA.radec_roll_deg, ROSETTA.
 
 
 def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field, ...]:
-    """The fields in which a bench is shown: the thesis's three, and the one at `radec_roll_deg`."""
+    """The fields in which a bench is shown: the thesis's three, and the user's own where one is
+    given.
+    """
     three = (*FIELDS[:2], ZETA_CAS)
     if radec_roll_deg is None:
         return three

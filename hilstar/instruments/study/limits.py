@@ -112,7 +112,8 @@ class LimitRow:
 class Limit:
     """A method's error (n,) against a stress (n,), from easy to hard; `unit` is the error's.
 
-    `says` names the place where the method leaves its tolerance, whose figure stands in its braces.
+    `says` describes the stress at which the method leaves its tolerance; its braces take the
+    figure.
     """
 
     method: str
@@ -124,7 +125,7 @@ class Limit:
 
     @property
     def at_unit(self) -> str:
-        """The stress's unit, in brackets at its end, or what it counts."""
+        """The stress's unit: in brackets at its end, or what it counts."""
         bracketed = self.stress.partition("[")[2].partition("]")[0]
         return bracketed or self.stress.split()[0].rstrip(",")
 
@@ -172,7 +173,7 @@ class Limit:
 
 
 def narrow_sprites() -> Limit:
-    """The place of a star that is integrated over pixels, against its sigma."""
+    """The place of a star whose light is integrated over pixels, against its sigma."""
     sigmas_px = np.geomspace(0.9, 0.1, 33)
     phases = np.linspace(-0.5, 0.5, 21)
     pixels = np.arange(-8.0, 9.0)
@@ -186,7 +187,7 @@ def narrow_sprites() -> Limit:
 
 
 def coarse_codes(quick: bool) -> Limit:
-    """The light of a star of exact codes, against the monitor's bits."""
+    """The light of a star with exact codes, against the monitor's bits."""
     bits = (10, 8, 6, 4) if quick else (12, 10, 9, 8, 7, 6, 5, 4)
     errors: list[float] = []
     for count in bits:
@@ -203,7 +204,7 @@ def coarse_codes(quick: bool) -> Limit:
 
 
 def faint_stars(quick: bool) -> Limit:
-    """The place of a star of exact codes by the plain moment, against how faint it is."""
+    """The place of a star with exact codes by the plain moment, against its magnitude."""
     mags = np.linspace(0, 9, 5 if quick else 13)
     stars = codes.code_errors(COARSE_BITS, EXACT, 8, mags)
     errors = [star.max_px("moment") for star in stars]
@@ -212,7 +213,7 @@ def faint_stars(quick: bool) -> Limit:
 
 
 def red_stars() -> Limit:
-    """The light of spectra that are found by V-I, the median of those held out, against V-I."""
+    """The light of held-out spectra by their V-I, median, against V-I."""
     library = load_library()
     rates = library_electrons_per_s(library, study_optics("ccd47-20"), Photometry())
     errors = held_out_errors(rates)
@@ -226,7 +227,7 @@ def red_stars() -> Limit:
 
 
 def crowds() -> Limit:
-    """The light of stars that have no room in a frame, against the stars in view."""
+    """The light of stars that do not fit into a frame, against the stars in view."""
     counts = np.geomspace(3e3, 3e6, 19)
     room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
     rng = np.random.default_rng(SEED)
@@ -240,7 +241,7 @@ def crowds() -> Limit:
 
 
 def tilted_screen() -> Limit:
-    """The places of a pinhole on a tilted screen, rms after alignment, against the tilt."""
+    """The places of a pinhole model on a tilted screen, rms after alignment, against the tilt."""
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     x_px, y_px = camera.grid_px((13, 9))
     shown = normalise(camera.rays(x_px, y_px))
@@ -296,9 +297,9 @@ def poles() -> Limit:
 
 
 def parted_refreshes() -> Limit:
-    """A star's place over an exposure that is no whole number of refreshes, against the turn.
+    """A star's place over an exposure of 6.3 refreshes, against the turn.
 
-    `study timing` holds this law to the virtual tracker.
+    `study timing` checks this law with the virtual tracker.
     """
     rates_deg_s = np.geomspace(0.03, 30.0, 13)
     worst = beat(Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)).worst_arcsec_per_deg_s or 0.0
@@ -318,7 +319,9 @@ def predicted_rms_arcsec(
     packet_hz: float,
     age_ms: float,
 ) -> float:
-    """The error of prediction of a movement, rms over its frames; packets arrive `age_ms` old."""
+    """The rms error of the predicted attitude over the frames of a movement; packets arrive
+    `age_ms` old.
+    """
     way = next(predictor for predictor in predictors() if predictor.is_default)
     errors = []
     for frame in range(int(SPAN_S * REFRESH_HZ)):
@@ -334,9 +337,7 @@ def predicted_rms_arcsec(
 
 
 def old_packets(quick: bool) -> Limit:
-    """Error of a predicted attitude, on a slew with jitter, against the age of the newest
-    packet.
-    """
+    """The predicted attitude of a shaken slew, against the age of the newest packet."""
     ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
     says = "packets over {} ms old"
@@ -344,9 +345,7 @@ def old_packets(quick: bool) -> Limit:
 
 
 def few_packets(quick: bool) -> Limit:
-    """Error of a predicted attitude, on the same slew and without delay, against the rate of
-    packets.
-    """
+    """The predicted attitude of the same slew without delay, against the packet rate."""
     rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
     return Limit(
@@ -360,7 +359,7 @@ def few_packets(quick: bool) -> Limit:
 
 
 def vibrations(quick: bool) -> Limit:
-    """Prediction over 20 ms of a vibration, against its frequency."""
+    """The predicted attitude of a vibration, 20 ms ahead, against its frequency."""
     frequencies_hz = np.geomspace(0.5, 45.0, 6 if quick else 12)
     errors = []
     for hz in frequencies_hz.tolist():

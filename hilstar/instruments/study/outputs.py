@@ -42,8 +42,8 @@ FIGURES = {"orion": "5.3 to 5.7", "lyra": "5.8 to 5.12", "rosetta": "5.14 to 5.1
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A field before a camera: stem of its files, title, and star of its zoom (None: the
-    brightest).
+    """A field before a camera: the stem of its files, its title, and the star of its zoom (None:
+    the brightest).
     """
 
     stem: str
@@ -54,7 +54,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """A scene's exposures without and with noise, and what its sky has."""
+    """A scene's exposures without and with noise, and its sky."""
 
     clean: Exposure
     noisy: Exposure
@@ -119,7 +119,7 @@ def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float
 
 
 def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
-    """Expose a scene and write its files; what it has, in a line."""
+    """Expose a scene and write its files; a line about it."""
     noise = FrameNoise(seed=SEED)
     with Simulator(file) as simulator:
         view = simulator.view(from_radec_roll_deg(*scene.field.radec_roll_deg), np.zeros(3))
@@ -165,7 +165,7 @@ def _scene_words(outputs: Outputs) -> str:
 
 
 def heat_words(kelvin: FloatArray) -> str:
-    """The hottest and the mean of temperatures (n,), NaN where not known; nothing where none is."""
+    """The hottest and the mean of temperatures (n,), in words; empty where none is known."""
     if not np.isfinite(kelvin).any():
         return ""
     return f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"

@@ -146,9 +146,9 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
 def bench_rapp(
     directory: Path, file: BenchFile, radec_roll_deg: tuple[float, float, float] | None = None
 ) -> list[ChartFinding]:
-    """The three ratios of a bench's tracker, and RAPP3 of the stars that it sees.
+    """The three ratios of a bench's tracker, and RAPP3 of the stars in its fields.
 
-    The stars are those of the thesis's fields, and of one of one's own. The curves are of black
+    The fields are the thesis's, and the user's own where one is given. The curves are of black
     bodies; the stars have the spectra that the bench gives them. Raises InputError.
     """
     optics = bench_optics(file.config.tracker, file.folder)
@@ -234,7 +234,7 @@ def _star_rows(in_field: FieldRatios, stars: Stars) -> list[StarRatio]:
 
 
 def _note(optics: Optics, solid: Weighting) -> str:
-    """What the ratios are of, and which weighting is drawn how."""
+    """What the ratios compare, and how each weighting is drawn."""
     (dotted,) = set(WEIGHTINGS) - {solid}
     low_nm, high_nm = optics.range_nm
     return (

@@ -4,10 +4,10 @@ of each compensation.
 The virtual tracker integrates over several frames of a simulated panel, which lights row by row and
 holds each row until it is written again. Its image is compared with that of the sky in the same
 exposure, star by star. Each row is at its own phase, so the stars of one exposure see the whole
-beat. The beat is compared with the prediction of `run.sync`.
+beat. The beat is compared with the prediction of `server.sync`.
 
 Before a tracker with a rolling shutter such a display shows stripes: the tracker is at rest and
-without noise, the glow of the black level shows each row's light, and lines are `run.sync`'s at
+without noise, the glow of the black level shows each row's light, and lines are `server.sync`'s at
 each row's own phase.
 """
 
@@ -130,7 +130,7 @@ STRIPE_CASES: tuple[StripeCase, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class StripePoint:
-    """A row of one case: its light relative to the mean, seen and foretold."""
+    """A row of one case: its light relative to the mean, measured and foretold."""
 
     refreshes: float
     lit_ms: float
@@ -140,7 +140,7 @@ class StripePoint:
 
 
 def stripe_points(case: StripeCase) -> list[StripePoint]:
-    """The rows of one case, every so many."""
+    """The rows of one case, every EVERY_ROWS."""
     exposure_s = case.refreshes / REFRESH_HZ
     tables: dict[str, study_benches.Table] = {
         "tracker": {
@@ -170,8 +170,10 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
 
 
 def left_edge_e(path: Path, tables: Mapping[str, study_benches.Table], view: View) -> FloatArray:
-    """The electrons of an exposure at the left edge, every so many rows: the boresight's stars are
-    elsewhere. The bench file is written to `path`.
+    """The electrons of an exposure at the left edge, every EVERY_ROWS rows; the bright stars are
+    elsewhere.
+
+    The bench file is written to `path`.
     """
     path.write_text(study_benches.bench_text(tables), encoding="utf-8")
     tracker = DisplayTracker(read_bench_file(path))
@@ -181,8 +183,10 @@ def left_edge_e(path: Path, tables: Mapping[str, study_benches.Table], view: Vie
 
 
 def row_lateness(file: BenchFile) -> FloatArray:
-    """By how many refreshes a row's exposure begins after its part of the screen lights, every so
-    many rows; the middle rows begin together.
+    """How many refreshes after its part of the screen lights a row's exposure begins, every
+    EVERY_ROWS rows.
+
+    The middle rows begin together.
     """
     config = file.config
     monitor = bench_camera(config, file.folder)
@@ -235,7 +239,7 @@ def stripe_case(point: StripePoint) -> StripeCase:
 
 
 def slew(rate_deg_s: float) -> Movement:
-    """A turn at a constant rate from t = 0 on, with the packets that report it."""
+    """A turn at a constant rate, and the packets that report it."""
     return Movement(from_radec_roll_deg(*RADEC_ROLL_DEG), rate_deg_s, PACKET_HZ, shaken=False)
 
 
@@ -258,11 +262,10 @@ WAYS: dict[str, Compensation] = {
 def frame_weights(
     rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]
 ) -> FloatArray:
-    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r);
-    `rows` from 0 to 1.
+    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,): (k, r).
 
-    A row lights `rows` of the scan-out after the swap, and shows the frame until the next one
-    reaches it.
+    `rows` run from 0 to 1. A row lights `rows` of the scan-out after the swap, and shows the frame
+    until the next one reaches it.
     """
     begins = np.asarray(swaps_s)[:, None] + rows * scan.scanout_s
     ends = begins + scan.hold_s
@@ -271,8 +274,8 @@ def frame_weights(
 
 
 class ScanningPanel(Closing):
-    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of
-    it. Free it with `close`.
+    """A bench with one compensation, shown on a panel that scans, and a tracker in front of it.
+    Free it with `close`.
 
     Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
     """
@@ -389,7 +392,7 @@ class TimingSky(Closing):
 
 @dataclass(frozen=True, slots=True)
 class TimingCase:
-    """Refreshes in an exposure, and for how much of a refresh a row stays lit."""
+    """Refreshes in an exposure, and the share of a refresh for which a row stays lit."""
 
     refreshes: float
     lit: float = 1.0
@@ -402,10 +405,10 @@ class TimingCase:
     @property
     def words(self) -> str:
         """For a legend."""
-        words = f"{self.refreshes:g} refreshes"
+        refreshes = f"{self.refreshes:g} refreshes"
         if self.lit == 1:
-            return words
-        return f"{words}, lit {self.lit:g} of each"
+            return refreshes
+        return f"{refreshes}, lit {self.lit:g} of each"
 
 
 CASES: tuple[TimingCase, ...] = (
@@ -420,10 +423,10 @@ QUICK_CASES: tuple[TimingCase, ...] = (TimingCase(6.0), TimingCase(6.3), TimingC
 
 @dataclass(frozen=True, slots=True)
 class BeatPoint:
-    """One star of one exposure, measured and foretold; the exposure begins `phase` refreshes after
-    its row lights.
+    """One star of one exposure, measured and foretold.
 
-    `off_arcsec` is along the star's motion, `light_mag` against the mean light of the panel.
+    The exposure begins `phase` refreshes after the star's row lights. `off_arcsec` is along the
+    star's motion, `light_mag` relative to the panel's mean light.
     """
 
     refreshes: float
@@ -526,7 +529,7 @@ def case_line(case: TimingCase, points: Sequence[BeatPoint]) -> str:
 
 
 def _off_arcsec(points: Sequence[BeatPoint]) -> float:
-    """How far stars are from where they were foretold, rms."""
+    """The rms distance of stars from their foretold places, arcsec."""
     off = np.array([point.off_arcsec - point.foretold_arcsec for point in points])
     return float(np.sqrt(np.mean(off**2)))
 
@@ -554,9 +557,7 @@ def draw_beat(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]
 
 @dataclass(frozen=True, slots=True)
 class ForetoldBeat:
-    """The error of a star that `run.sync` foretells for a phase of the exposure; its columns are
-    those of BeatPoint.
-    """
+    """The error that `server.sync` foretells for one phase; its columns are those of BeatPoint."""
 
     refreshes: float
     lit: float
@@ -566,7 +567,7 @@ class ForetoldBeat:
 
 
 def foretold_beat(case: TimingCase) -> list[ForetoldBeat]:
-    """A case at every phase."""
+    """The foretold errors of a case at every phase."""
     phases = np.linspace(0, 1, BEAT_PHASES)
     foretold = seen_at(case.exposures, phases)
     off_arcsec = foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG
@@ -591,7 +592,7 @@ def beat_case(row: BeatPoint | ForetoldBeat) -> TimingCase:
 @dataclass(frozen=True, slots=True)
 class TimingOutcome:
     """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error,
-    mag, and drawing time, ms.
+    mag, and the time of a frame, ms.
     """
 
     way: str

@@ -46,7 +46,7 @@ MIN_HEIGHT_INCH, HEAD_INCH, NAME_INCH = 4.2, 1.9, 0.17
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A measure of methods: its name and unit; figures under `floor` count as 0."""
+    """A measure of methods: its name and unit; values below `floor` count as 0."""
 
     name: str
     unit: str
@@ -79,10 +79,10 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """All methods of a step. `work` names the timed work, `why_default` is the reason for the
-    default where another beats it.
+    """All methods of a step. `work` names the timed work, `why_default` is the reason to keep the
+    default where another method beats it.
 
-    `remark` is a caution that the figures alone would hide. `load` is what others took while it was
+    `remark` is a caution that the figures do not show. `load` is the work of others while it was
     timed.
     """
 
@@ -202,8 +202,8 @@ def said(value: float, figure: Figure) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FrontPoint:
-    """A choice on a chart of error against time: its place, its colour, the ends of its bar, and
-    the colours of the rings about it.
+    """A choice on a chart of error against time: its place and colour, the ends of its bar, and the
+    colours of its rings.
     """
 
     time_ms: float

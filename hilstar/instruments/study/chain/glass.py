@@ -92,7 +92,7 @@ class GlassRow:
 
 @dataclass(frozen=True, slots=True)
 class GlassErrors:
-    """How far off a PSF has so many stars: place, rms arcsec; light, rms and largest, %."""
+    """The errors of a PSF over some stars: place, arcsec rms; light, rms and largest, %."""
 
     stars: int
     error_arcsec: float
@@ -162,7 +162,7 @@ def _drawable(whole: GlassPsf) -> Iterator[tuple[str, Psf]]:
 def _errors(
     tracker: Simulator, whole: GlassPsf, psfs: Mapping[str, Psf], scene: ChainScene
 ) -> dict[str, GlassErrors]:
-    """How far off each PSF has the stars of a scene; none where too few are lit."""
+    """The errors of each PSF in a scene; empty where too few stars are lit."""
     reach = whole.footprint_px // 2
     stars = field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam)
     row = np.floor(stars["y_px"] + 0.5).astype(np.intp)
@@ -198,7 +198,7 @@ def _rms(errors: FloatArray) -> float:
 
 
 def glass_line(rows: Sequence[GlassRow]) -> str:
-    """What the PSFs cost, for a person."""
+    """The errors and times of the PSFs, in words."""
     scene = f"{rows[0].scene}, {rows[0].stars} stars"
     return f"PSF of the tracker's glass, {scene}: {'; '.join(row.words() for row in rows)}"
 

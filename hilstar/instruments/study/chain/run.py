@@ -119,12 +119,12 @@ def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
 
 
 def without_fronts(row: CombinationRow) -> CombinationRow:
-    """A row that was timed on a busy machine: on which fronts it is, no time says."""
+    """A row without fronts, as times taken on a busy machine tell none."""
     return replace(row, on_front="", on_front_mag="", on_front_as_filed="")
 
 
 def front(rows: Sequence[CombinationRow], error: str) -> list[bool]:
-    """Whether each row is on the front of its time and `error`, the name of one of its columns."""
+    """Whether each row is on the front of time and `error`, which is the name of a column."""
     errors = [getattr(row, error) for row in rows]
     times_ms = [row.time_ms for row in rows]
     return list(map(bool, pareto_front(errors, times_ms)))
@@ -136,7 +136,10 @@ def auto_of(rows: Sequence[CombinationRow]) -> int:
 
 
 def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
-    """Whether a row shares with `own` the choices that belong to the bench file and the sender."""
+    """Whether a row shares with `own` the choices that effort does not make.
+
+    Those are the bench file's and the sender's.
+    """
     given = ("bit_stealing", "faintest_v_mag", "prediction")
     return all(getattr(row, name) == getattr(own, name) for name in given)
 
@@ -144,11 +147,11 @@ def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
 def beating(
     rows: Sequence[CombinationRow], as_filed: bool = False
 ) -> tuple[list[CombinationRow], list[CombinationRow]]:
-    """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that
-    effort may choose.
+    """The rows that beat `auto` by arcsec and time: beyond the noise, and within it.
 
-    Beyond it are those faster by more than three sigmas of the difference of the medians. Else this
-    run cannot tell the times apart, and which row is on the front is chance.
+    With `as_filed` only those that effort may choose. Beyond the noise are rows faster by more than
+    three sigmas of the difference of the medians. Within it this run cannot tell the times apart,
+    and chance decides who is on the front.
     """
     auto_row = rows[auto_of(rows)]
     rivals = [row for row in rows if not as_filed or left_to_effort(row, auto_row)]
@@ -174,9 +177,7 @@ def scene_line(
     stages: Sequence[StageTime],
     load: Load,
 ) -> str:
-    """One scene: the choice of `auto`, its error and time, its place relative to the front, and
-    the largest part of each.
-    """
+    """One scene in words: what `auto` chooses, its error and time, and the largest part of each."""
     auto_row = rows[auto_of(rows)]
     stands = NOT_JUDGED if load.busy else standing(rows)
     largest = max(steps_of(budget), key=lambda part: part.error_arcsec)
@@ -211,7 +212,7 @@ def by_scene(rows: Sequence[CombinationRow]) -> dict[str, list[CombinationRow]]:
 
 
 def headline(rows: Sequence[CombinationRow], load: Load) -> str:
-    """What the whole table says of `auto`; nothing on a busy machine."""
+    """What the table says of `auto`, as the chart's title; nothing on a busy machine."""
     scenes = by_scene(rows)
     beaten = [name for name, scene_rows in scenes.items() if beating(scene_rows)[0]]
     where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
@@ -224,8 +225,8 @@ def headline(rows: Sequence[CombinationRow], load: Load) -> str:
 
 
 def standing(rows: Sequence[CombinationRow]) -> str:
-    """Whether `auto` is on the front or within its noise; else its better, the reason, and its
-    place among effort's choices.
+    """Whether `auto` is on the front, in words; if not, what beats it and why effort does not take
+    that.
     """
     beyond, within = beating(rows)
     auto_row = rows[auto_of(rows)]
@@ -307,7 +308,7 @@ def _compared(own: CombinationRow, other: CombinationRow) -> str:
 
 
 def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
-    """The scenes to be drawn, each with those of its rate in which `auto` is as far off."""
+    """The scenes to draw, each with the scenes of the same rate whose error is alike."""
     alike: dict[str, list[str]] = {}
     autos: list[CombinationRow] = []
     for row in rows:
@@ -436,7 +437,7 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
 def budget_finding(
     scenes: Sequence[str], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load
 ) -> str:
-    """The largest part of the error of each scene, and that of the time."""
+    """The largest part of each scene's error, and the longest stage."""
     most = []
     for scene in scenes:
         largest = max(steps_of(budget, scene), key=known_error)
@@ -448,7 +449,7 @@ def budget_finding(
 
 
 def known_error(part: ErrorPart) -> float:
-    """The error of a part; one that is not known is the largest."""
+    """The error of a part; an unknown one counts as the largest."""
     if math.isfinite(part.error_arcsec):
         return part.error_arcsec
     return math.inf

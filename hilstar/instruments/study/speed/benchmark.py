@@ -155,9 +155,7 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
 
 
 def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
-    """The methods that are installed here, imported and compiled; and by name the remedy for
-    each of the others.
-    """
+    """The installed methods, imported and compiled; and for each of the others how to install it."""
     draws: dict[str, Draw] = {}
     missing: dict[str, str] = {}
     for name, _, make in METHODS:
@@ -389,8 +387,9 @@ class CellMeasurement(Closing):
             self.result.rows.append(timing)
 
     def _too_long(self, draw: Draw, budget_s: float) -> str | None:
-        """Why a method is skipped here: its time for all stars, estimated from that for one star
-        and for a hundred more.
+        """Why a method is skipped here, or None.
+
+        Its time for all stars is estimated from that for one star and for a hundred more.
         """
         if len(self.sprites) <= 101:
             return None
@@ -456,8 +455,7 @@ class CellMeasurement(Closing):
 def interleaved(
     works: dict[str, Callable[[], object]], rounds: int, budget_s: float
 ) -> dict[str, list[float]]:
-    """Times in ms of each work, taken in turn; slow ones take fewer turns, evenly, to stay within
-    `budget_s` each.
+    """Times of each work, ms, in turn; a slow work gets fewer turns, to stay within `budget_s`.
 
     The first turn counts only where no other fits.
     """
@@ -572,7 +570,7 @@ def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFi
 
 
 def _aims(result: report.Result) -> list[report.Aim]:
-    """What the project set itself, beside what was measured."""
+    """The project's aims, beside the measured times."""
     aims = [*_frame_aims(result.rows), *_python_aims(result.python_ms)]
     starts_ms = []
     for start in result.startup:

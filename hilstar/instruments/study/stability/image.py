@@ -90,12 +90,12 @@ TOGETHER = (
 
 
 def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
-    """A linear image, whose stars are round."""
+    """A linear image with round stars."""
     return Target(size_px, GaussianPsf((sigma_px, sigma_px)))
 
 
 def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> FrameLight:
-    """A star of a target's sigma."""
+    """One star with the sigma of a target."""
     star = np.zeros(1, dtype=np.intp)
     x, y, rate = np.array([[x_px], [y_px], [electrons_per_s]])
     return pack_sprites(x, y, rate, star, on.resolution_px, on.psf.footprint_px)
@@ -122,8 +122,9 @@ def drawn(on: Target, sprites: FrameLight) -> FloatArray:
 def _outer(
     on: Target, sprites: FrameLight, shares: Callable[[FloatArray, float], FloatArray]
 ) -> FloatArray:
-    """One star's image from its shares along each axis, by a pixel's offset from it and sigma,
-    px.
+    """One star's image from its shares along each axis.
+
+    `shares` takes the pixels' offsets from the star, px, and its sigma, px.
     """
     width, height = on.resolution_px
     sigma_x, sigma_y = on.psf.width_px
@@ -262,7 +263,7 @@ def wide_star() -> FailureCase:
 
 
 def negative_wings() -> FailureCase:
-    """Far out both erfs are 1 but for rounding."""
+    """Far from a star both erfs are 1 but for rounding."""
     on = target(20.0)
     sprites = one_star(*OFF_MIDDLE_PX, on)
     bare = bare_polynomial(on, sprites)
@@ -455,13 +456,13 @@ def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[FrameLight
 
 
 def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
-    """Its light (steps,) in each image."""
+    """The moving star's light (steps,) in each image."""
     return np.array([draw(sprites).sum() for sprites in moving_star(on)])
 
 
 @cache  # a case and a chart
 def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
-    """The light (steps,) that an sRGB monitor makes of it, relative to the light wanted.
+    """The light (steps,) of the moving star on an sRGB monitor, relative to the wanted light.
 
     It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
     """
@@ -478,12 +479,12 @@ def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
 
 
 def ripple(fluxes: FloatArray) -> float:
-    """From the faintest to the brightest of a star's fluxes, relative to their mean."""
+    """The range of a star's fluxes, relative to their mean."""
     return float((fluxes.max() - fluxes.min()) / fluxes.mean())
 
 
 def ripple_mag(fluxes: FloatArray) -> float:
-    """From the faintest to the brightest of a star's fluxes, mag."""
+    """The range of a star's fluxes, mag."""
     return float(magnitude(float(fluxes.min() / fluxes.max())))
 
 
@@ -577,7 +578,7 @@ def error_steps(codes: Levels, scene: CodeScene) -> float:
 def sprites_of(
     x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float
 ) -> FrameLight:
-    """Stars at places (n,), so many magnitudes (n,) under the one whose peak is white."""
+    """Stars at places (n,), px, in magnitudes (n,) under the one whose peak is white."""
     psf = GaussianPsf((sigma_px, sigma_px))
     light = WHITE * flux_ratio(under_white_mag) / psf.peak_share
     star = np.arange(len(x_px))
@@ -615,7 +616,7 @@ def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
 
 
 def half_off() -> CodeScene:
-    """Stars whose middles lie on the screen's edges, at every phase along them and across."""
+    """Stars centred on the screen's edges, at every place within a pixel along and across them."""
     count = COUNT - 2
     along = middles()[0][1 : COUNT - 1]
     across = (np.roll(np.arange(count), 2) + 0.5) / count - 1.0

@@ -152,8 +152,9 @@ class BlackBodies:
         return np.full(len(self.bv_mag), rate)
 
     def _rates(self, integral: Callable[..., FloatArray]) -> FloatArray:
-        """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one
-        tolerance fits all stars.
+        """Thesis eq. 3.1 by any way of integrating.
+
+        Spectra are scaled to 1 at 550 nm, so that one tolerance fits all stars.
         """
         kelvin = self.kelvin[:, None]
         passband = load_curve("johnson-v", "johnson-v")
@@ -188,8 +189,8 @@ def adaptive_integral(integrand: Integrand, *curves: Curve) -> FloatArray:
 
 
 def brightness(stack: ExitStack, quick: bool) -> Trials:
-    """The integral of black bodies through a sensor: error, mag, worst over COLOURS of the
-    catalogue and at the median one.
+    """The integral of black bodies through a sensor: errors, mag, of the worst and the median of
+    COLOURS stars of the catalogue.
     """
     del stack, quick
     # Equal shares of the catalogue, the bluest and the reddest star among them.
@@ -408,8 +409,8 @@ def _psf_errors(size_px: int, image: Callable[[FrameLight], FloatArray]) -> tupl
 
 
 def quantisation(stack: ExitStack, quick: bool) -> Trials:
-    """From light to codes at the default depth: flux error, mag, and centroid error, px, of a
-    star at its aim's faint end.
+    """From light to codes at the default depth: errors of a star at the faint end of its aim, mag
+    and px.
     """
     del quick  # every error is found at once
     bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
@@ -447,8 +448,8 @@ def _codes(renderer: Renderer, field: FrameLight, numbers: Iterator[int]) -> Non
 
 
 def depth(stack: ExitStack, quick: bool) -> Trials:
-    """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in
-    the field.
+    """How faint the catalogue goes: the light of the whole sky that is lost, %, and the stars in
+    the frame.
     """
     del quick
     config = demo_config()

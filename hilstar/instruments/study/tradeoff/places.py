@@ -168,9 +168,7 @@ def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
 
 
 def random_turns(count: int, camera: Camera) -> list[FloatArray]:
-    """ICRS to image axes, (3, 3) each, at attitudes of which any is as likely as any other;
-    ORION is the first.
-    """
+    """Rotations from ICRS to image axes, (3, 3) each: ORION's, then uniformly random ones."""
     random_q = normalise(np.random.default_rng(SEED).normal(size=(count - 1, 4)))
     return [turn_to_image(q, camera) for q in (ORION, *random_q)]
 
@@ -193,7 +191,7 @@ def scan(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
 
 
 def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
-    """The stars within a circle about the boresight, by all their angles."""
+    """The stars within a circle about the boresight, by the angles of all stars."""
     radius_rad = camera.field_radius_rad(MARGIN_PX)
     near = np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad))
     return CulledStars(projected(stars, near, turn, camera), len(stars))
@@ -207,7 +205,7 @@ def by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
 
 
 def projected(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
-    """Those of `near` (n,) that are in view."""
+    """The stars of `near` (n,) that are in view."""
     x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
     rates = stars.electrons_per_s[near]
     side_px = SPRITE_PSF.footprint_px
@@ -215,8 +213,8 @@ def projected(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) ->
 
 
 def culling(stack: ExitStack, quick: bool) -> Trials:
-    """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars
-    tested that are not in view.
+    """How the stars in view are found: stars missed over ATTITUDES fields, and stars tested in
+    vain.
     """
     del stack
     camera = ideal_monitor(demo_config())
@@ -255,8 +253,8 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
 
 
 def projection(stack: ExitStack, quick: bool) -> Trials:
-    """Errors of star places, px, by the number format in which they are computed: the largest and
-    the rms over the stars of ATTITUDES random fields.
+    """Errors of star places, px, by number format: largest and rms over the stars of ATTITUDES
+    fields.
     """
     del stack
     camera = ideal_monitor(demo_config())
@@ -311,8 +309,8 @@ class SmearBench:
         return smeared_sprites(stars, self.motion, self.camera, self.psf)
 
     def chain(self, at: FloatArray, share: FloatArray, stars: Stars) -> FrameLight:
-        """Stars at the parts `at` (k,) of the exposure, 0 its middle, with shares (k,) of their
-        light.
+        """Stars at the parts `at` (k,) of the exposure with shares (k,) of their light; 0 is its
+        middle.
         """
         x_px, y_px = self.places_px(stars, at)
         light = np.outer(share, stars.electrons_per_s).ravel()
@@ -322,7 +320,7 @@ class SmearBench:
         return pack_sprites(x_px.ravel(), y_px.ravel(), light, star, size_px, side_px)
 
     def places_px(self, stars: Stars, at: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (k, n), px, at the parts `at` (k,) of the exposure, 0 its middle."""
+        """Places (k, n), px, at the parts `at` (k,) of the exposure; 0 is its middle."""
         turns = self.motion.icrs_to_image(at * self.motion.exposure_s, self.camera)
         directions = stars.vectors @ turns.transpose(0, 2, 1)
         x_px, y_px = self.camera.project(directions.reshape(-1, 3))
@@ -361,7 +359,7 @@ def smear_bench() -> SmearBench:
 
 
 def smear_methods(bench: SmearBench) -> dict[str, SpritesOf]:
-    """Every fixed number of sprites on a path: by Gauss-Legendre quadrature, and evenly in time."""
+    """Every fixed number of sprites on a path, by Gauss-Legendre quadrature and evenly in time."""
     methods: dict[str, SpritesOf] = {}
     for count in (*GAUSS, EXACT_NODES):
         nodes, weights = np.polynomial.legendre.leggauss(count)

@@ -64,7 +64,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def cells_of_trial(step: Trials, trial: Trial) -> dict[str, object]:
-    """A trial's cells by column; those that do not hold for it are empty."""
+    """A trial's cells by column; a cell that does not apply is empty."""
     first_ms, third_ms = trial.quartiles_ms
     cells: dict[str, object] = {
         "step": step.name,
@@ -90,6 +90,6 @@ def cells_of_trial(step: Trials, trial: Trial) -> dict[str, object]:
 
 
 def this_machine() -> str:
-    """The machine and GL that the times hold for."""
+    """The renderer and the cores on which the times were taken."""
     with Renderer(Target((8, 8), SPRITE_PSF)) as renderer:
         return f"{renderer.gl_renderer}, {os.cpu_count()} cores"

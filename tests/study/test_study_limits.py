@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import limits
-from hilstar.instruments.study.limits import Limit, limits_finding, run
+from hilstar.instruments.study.limits import StressLimit, limits_finding, run
 from tests.support.pictures import assert_drawn, table
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -79,8 +79,8 @@ def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(study):
     assert 0.1 * widest_px < error[0] < 0.6 * widest_px
 
 
-def planted(errors, at=(1.0, 2.0, 4.0)) -> Limit:
-    return Limit(
+def planted(errors, at=(1.0, 2.0, 4.0)) -> StressLimit:
+    return StressLimit(
         "A method", limits.AGE, "packets over {} ms old", "px", np.array(at), np.array(errors)
     )
 

@@ -75,15 +75,15 @@ BODIES: dict[str, tuple[Table, Table]] = {
 FRAME_NS = round(NS_PER_S / REFRESH_HZ)
 SIGMA_PX = (0.85, 0.85)
 MIDDLE_PX = (0.2, -0.3)  # disc centre from the middle pixel's centre: off any symmetry
-FOCAL_PX = 6000.0
+FOCAL_PX = 6000.0  # a pixel is 34 arcsec, as on the demo's monitor
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
 QUICK_RADII_PX = (0.1, 2.0, 12.0)
 PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
 # along each side: at most 0.07 px apart, under a tenth of sigma
 MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400
 LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
-PLACES = 60
-MARGIN_PX = 8
+PLACES = 60  # along a limb, where its edge is found
+MARGIN_PX = 8  # around a disc: nine sigmas of its light
 # Degrees from the boresight to the body's middle, of the Earth beyond its limb (negative: on it)
 NEAR_DEG: dict[str, tuple[float, ...]] = {
     "Moon": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
@@ -97,7 +97,8 @@ QUICK_DEG: dict[str, tuple[float, ...]] = {
 }
 ROUNDS, QUICK_ROUNDS = 40, 3
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
-FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
+FLUX_LIMIT, LIMB_LIMIT_PX = 0.01, 0.1
+DISC_PX = 0.2  # a body of a smaller diameter is drawn as a point
 FLOOR = 1e-6  # lower end of the chart's axis
 SMALL = {"ms": 4}
 BESIDE_AXIS = (0.3, 1.0, 0.0)  # the Sun stands beside a disc, across this axis

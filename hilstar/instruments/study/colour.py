@@ -467,7 +467,7 @@ def study_choices(
 def colour_figures(
     stars: ShownStars, colours: Colours, subtypes: Callable[[FloatArray], FloatArray]
 ) -> tuple[float, ...]:
-    """The errors of a choice: subtypes and % of temperature; mag, % of a channel and px, of 95 %."""
+    """The errors of a choice: subtypes, % of temperature; mag, % of a channel, px, of 95 %."""
     shown = colours.shown(stars.shares)
     true_subtypes = subtypes(stars.wanted[:, : shown.shape[1]])
     off_subtypes = np.abs(subtypes(shown) - true_subtypes).mean()

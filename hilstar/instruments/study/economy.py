@@ -46,7 +46,7 @@ COLOURS = {8: ORANGE, 10: BLUE, 12: MUTED}
 
 
 @dataclass(frozen=True, slots=True)
-class Tolerance:
+class EffortTolerance:
     """The largest allowed error of a star, mag and px, and the tolerance's name."""
 
     name: str
@@ -54,8 +54,8 @@ class Tolerance:
     px: float
 
 
-DEFAULT = Tolerance("default", DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX)
-TOLERANCES: tuple[Tolerance, ...] = (DEFAULT, Tolerance("0.1", 0.1, 0.1))
+DEFAULT = EffortTolerance("default", DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX)
+TOLERANCES: tuple[EffortTolerance, ...] = (DEFAULT, EffortTolerance("0.1", 0.1, 0.1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
     return load.judged(lines)
 
 
-def effort_keys(tolerance: Tolerance) -> Table:
+def effort_keys(tolerance: EffortTolerance) -> Table:
     """The keys of [render] by which effort keeps a tolerance."""
     return {**AUTO, "tolerance_mag": tolerance.mag, "tolerance_px": tolerance.px}
 

@@ -8,7 +8,7 @@ what was measured, and the law that foretells it. A panel has lines and points (
 bars (`BarSpec`), or some values of each row on a line of its own (`DotsSpec`).
 
 Methods with an error and a time are `Trials` (trials.py); a method that fails is a `FailureCase`
-(stability) or a `Limit` (limits.py); curves over one x are `CurvePanel`s, with no rows at all.
+(stability) or a `StressLimit` (limits.py); curves over one x are `CurvePanel`s, without rows.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -121,7 +121,7 @@ CASES: dict[str, list[dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class FaultCost:
-    """One case: the median time of a frame with the fault and without it, ms, in turn in one run."""
+    """One case: the median time of a frame with and without the fault, ms, in turn in one run."""
 
     quantisation: str
     case: str
@@ -163,7 +163,7 @@ def attitude_of(frame: int) -> FloatArray:
     return propagate(FIELD, SLEW_RAD_S, frame / REFRESH_HZ)
 
 
-class FaultyFrames:
+class CaseFrames:
     """The frames of a bench under the faults of a case, and the same frames without any."""
 
     def __init__(self, bench: Bench, folder: Path, case: str) -> None:
@@ -201,7 +201,7 @@ class FaultyFrames:
 
 def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     """The time of a frame with the faults of a case and without any, in turn."""
-    frames = FaultyFrames(bench, folder, case)
+    frames = CaseFrames(bench, folder, case)
     ms = medians_ms({"without": frames.without, "with": frames.with_faults}, rounds)
     quantisation = bench.config.render.quantisation
     cost_ms = ms["with"] - ms["without"]
@@ -209,7 +209,7 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
 
 
 def stray_light(bench: Bench, share: float) -> Stray:
-    """The errors of stars over even stray light: the frame with the stars, less that without them."""
+    """The errors of stars over even stray light, by frames with them and without them."""
     sprites = bench.light(bench.view(FIELD))
     lights: tuple[GlowLight, ...] = ()
     if share:
@@ -265,7 +265,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def cost_line(costs: Sequence[FaultCost], quantisation: str) -> str:
-    """The cost of a scenario with nothing on, of a false star and of the dearest fault, in words."""
+    """The cost of a scenario without faults, of a false star and of the dearest fault, in words."""
     by_case = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
     nothing = by_case[NOWHERE]
     star = by_case["false star, on the sky"]

@@ -6,7 +6,7 @@ OWN = "field"
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class SkyField:
     """A field: the stem of its files, its name and place, and the star in the middle of the
     thesis's zoom.
     """
@@ -17,16 +17,16 @@ class Field:
     zoom_hip: int | None = None
 
 
-FIELDS: tuple[Field, ...] = (
-    Field("orion", "Orion", (84.057, -1.200, 0.0), 26311),
-    Field("lyra", "Lyra", (283.021, 35.349, 0.0), 92420),
-    Field("rosetta", "zeta Cas before the Rosetta NAVCAM", (9.122, 53.817, 0.0), 2920),
+FIELDS: tuple[SkyField, ...] = (
+    SkyField("orion", "Orion", (84.057, -1.200, 0.0), 26311),
+    SkyField("lyra", "Lyra", (283.021, 35.349, 0.0), 92420),
+    SkyField("rosetta", "zeta Cas before the Rosetta NAVCAM", (9.122, 53.817, 0.0), 2920),
 )
-ROSETTA: Field = FIELDS[2]
-ZETA_CAS: Field = Field("zeta_cas", "zeta Cas", ROSETTA.radec_roll_deg, ROSETTA.zoom_hip)
+ROSETTA: SkyField = FIELDS[2]
+ZETA_CAS: SkyField = SkyField("zeta_cas", "zeta Cas", ROSETTA.radec_roll_deg, ROSETTA.zoom_hip)
 
 
-def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field, ...]:
+def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[SkyField, ...]:
     """The fields in which a bench is shown: the thesis's three, and the user's own where one is
     given.
     """
@@ -35,4 +35,4 @@ def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field,
         return three
     ra_deg, dec_deg, roll_deg = radec_roll_deg
     name = f"RA {ra_deg:g}, Dec {dec_deg:g}, roll {roll_deg:g}°"
-    return (*three, Field(OWN, name, radec_roll_deg))
+    return (*three, SkyField(OWN, name, radec_roll_deg))

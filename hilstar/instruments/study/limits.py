@@ -109,7 +109,7 @@ class LimitRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Limit:
+class StressLimit:
     """A method's error (n,) against a stress (n,), from easy to hard; `unit` is the error's.
 
     `says` describes the stress at which the method leaves its tolerance; its braces take the
@@ -172,7 +172,7 @@ class Limit:
         return rows
 
 
-def narrow_sprites() -> Limit:
+def narrow_sprites() -> StressLimit:
     """The place of a star whose light is integrated over pixels, against its sigma."""
     sigmas_px = np.geomspace(0.9, 0.1, 33)
     phases = np.linspace(-0.5, 0.5, 21)
@@ -183,17 +183,17 @@ def narrow_sprites() -> Limit:
         places = shares @ pixels / shares.sum(axis=1)
         errors.append(float(np.abs(places - phases).max()))
     says = "stars under {} px wide"
-    return Limit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
+    return StressLimit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
 
 
-def coarse_codes(quick: bool) -> Limit:
+def coarse_codes(quick: bool) -> StressLimit:
     """The light of a star with exact codes, against the monitor's bits."""
     bits = (10, 8, 6, 4) if quick else (12, 10, 9, 8, 7, 6, 5, 4)
     errors: list[float] = []
     for count in bits:
         (star,) = codes.code_errors(count, EXACT, 8, [FAINT_MAG])
         errors.append(star.flux_max_mag)
-    return Limit(
+    return StressLimit(
         "Exact codes, light",
         BITS,
         "codes under {} bits",
@@ -203,16 +203,18 @@ def coarse_codes(quick: bool) -> Limit:
     )
 
 
-def faint_stars(quick: bool) -> Limit:
+def faint_stars(quick: bool) -> StressLimit:
     """The place of a star with exact codes by the plain moment, against its magnitude."""
     mags = np.linspace(0, 9, 5 if quick else 13)
     stars = codes.code_errors(COARSE_BITS, EXACT, 8, mags)
     errors = [star.max_px("moment") for star in stars]
     stress = FAINT
-    return Limit("Exact codes, place", stress, "{} mag under white", "px", mags, np.array(errors))
+    return StressLimit(
+        "Exact codes, place", stress, "{} mag under white", "px", mags, np.array(errors)
+    )
 
 
-def red_stars() -> Limit:
+def red_stars() -> StressLimit:
     """The light of held-out spectra by their V-I, median, against V-I."""
     library = load_library()
     rates = library_electrons_per_s(library, study_optics("ccd47-20"), Photometry())
@@ -223,10 +225,10 @@ def red_stars() -> Limit:
         near = np.abs(library.vi_mag - centre) <= WINDOW_VI_MAG
         medians.append(float(np.median(np.abs(magnitude(1 + errors[near])))))
     says = "spectra over V-I {}"
-    return Limit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
+    return StressLimit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
 
 
-def crowds() -> Limit:
+def crowds() -> StressLimit:
     """The light of stars that do not fit into a frame, against the stars in view."""
     counts = np.geomspace(3e3, 3e6, 19)
     room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
@@ -237,10 +239,12 @@ def crowds() -> Limit:
         drawn = brightest(light, room)
         shown = light if drawn is None else light[drawn]
         errors.append(abs(magnitude(float(shown.sum() / light.sum()))))
-    return Limit("A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors))
+    return StressLimit(
+        "A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors)
+    )
 
 
-def tilted_screen() -> Limit:
+def tilted_screen() -> StressLimit:
     """The places of a pinhole model on a tilted screen, rms after alignment, against the tilt."""
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     x_px, y_px = camera.grid_px((13, 9))
@@ -257,10 +261,10 @@ def tilted_screen() -> Limit:
         rms_rad = float(np.sqrt((residual**2).sum(axis=1).mean()))
         errors.append(rms_rad * camera.focal_length_px)
     says = "a tilt over {} deg"
-    return Limit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
+    return StressLimit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
 
 
-def wide_fields() -> Limit:
+def wide_fields() -> StressLimit:
     """A direction onto the monitor's plane and back, against the angle from the axis."""
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     from_90_deg = np.geomspace(60.0, 1e-7, 15)
@@ -268,7 +272,7 @@ def wide_fields() -> Limit:
     true = np.stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)], axis=1)
     rays = normalise(camera.rays(*camera.project(true)))
     errors = np.linalg.norm(np.cross(rays, true), axis=1) * ARCSEC_PER_RAD
-    return Limit(
+    return StressLimit(
         "Perspective",
         "angle short of 90 deg [deg]",
         "{} deg short of 90",
@@ -278,7 +282,7 @@ def wide_fields() -> Limit:
     )
 
 
-def poles() -> Limit:
+def poles() -> StressLimit:
     """An attitude to RA, Dec and roll and back, against its distance from the pole."""
     from_pole_deg = np.geomspace(10.0, 1e-7, 15)
     errors = []
@@ -286,7 +290,7 @@ def poles() -> Limit:
         q = from_radec_roll_deg(123.4, 90.0 - distance, 56.7)
         back = from_radec_roll_deg(*to_radec_roll_deg(q))
         errors.append(angle_between_rad(q, back) * ARCSEC_PER_RAD)
-    return Limit(
+    return StressLimit(
         "RA, Dec and roll",
         "distance from the pole [deg]",
         "{} deg from the pole",
@@ -296,7 +300,7 @@ def poles() -> Limit:
     )
 
 
-def parted_refreshes() -> Limit:
+def parted_refreshes() -> StressLimit:
     """A star's place over an exposure of 6.3 refreshes, against the turn.
 
     `study timing` checks this law with the virtual tracker.
@@ -304,7 +308,7 @@ def parted_refreshes() -> Limit:
     rates_deg_s = np.geomspace(0.03, 30.0, 13)
     worst = beat(Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)).worst_arcsec_per_deg_s or 0.0
     stress = TURN
-    return Limit(
+    return StressLimit(
         "Refreshes in an exposure",
         stress,
         "turns over {} deg/s",
@@ -336,19 +340,19 @@ def predicted_rms_arcsec(
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def old_packets(quick: bool) -> Limit:
+def old_packets(quick: bool) -> StressLimit:
     """The predicted attitude of a shaken slew, against the age of the newest packet."""
     ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
     says = "packets over {} ms old"
-    return Limit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
+    return StressLimit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
 
 
-def few_packets(quick: bool) -> Limit:
+def few_packets(quick: bool) -> StressLimit:
     """The predicted attitude of the same slew without delay, against the packet rate."""
     rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
-    return Limit(
+    return StressLimit(
         "Prediction by rates",
         PACKETS,
         "under {} packets a second",
@@ -358,7 +362,7 @@ def few_packets(quick: bool) -> Limit:
     )
 
 
-def vibrations(quick: bool) -> Limit:
+def vibrations(quick: bool) -> StressLimit:
     """The predicted attitude of a vibration, 20 ms ahead, against its frequency."""
     frequencies_hz = np.geomspace(0.5, 45.0, 6 if quick else 12)
     errors = []
@@ -369,7 +373,7 @@ def vibrations(quick: bool) -> Limit:
             return propagate(ORION, Z, angle)
 
         errors.append(predicted_rms_arcsec(attitude, 100.0, 20.0))
-    return Limit(
+    return StressLimit(
         "Prediction over 20 ms",
         VIBRATION,
         "vibrations over {} Hz",
@@ -379,7 +383,7 @@ def vibrations(quick: bool) -> Limit:
     )
 
 
-def every_limit(quick: bool) -> list[Limit]:
+def every_limit(quick: bool) -> list[StressLimit]:
     """Every limit, in the order of the chain: light, places, time."""
     return [
         *(narrow_sprites(), coarse_codes(quick), faint_stars(quick)),
@@ -403,7 +407,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return lines
 
 
-def limits_finding(limits: Sequence[Limit]) -> str:
+def limits_finding(limits: Sequence[StressLimit]) -> str:
     """How many methods leave their tolerance, and where those do that a bench meets first."""
     failing = [limit for limit in limits if limit.fails]
     met = [limit.words for limit in failing if limit.stress in MET_FIRST]
@@ -411,7 +415,7 @@ def limits_finding(limits: Sequence[Limit]) -> str:
     return f"{count}: {', '.join(met)}"
 
 
-def draw(path: Path, limits: Sequence[Limit]) -> None:
+def draw(path: Path, limits: Sequence[StressLimit]) -> None:
     """A panel for each method: its error, the tolerance, and where they meet."""
     rows = math.ceil(len(limits) / COLUMNS)
     note = (
@@ -428,7 +432,7 @@ def draw(path: Path, limits: Sequence[Limit]) -> None:
             axes.set_axis_off()
 
 
-def draw_limit(axes: "Axes", limit: Limit) -> None:
+def draw_limit(axes: "Axes", limit: StressLimit) -> None:
     """One method: error against stress, from easy to hard, and where it meets its tolerance."""
     axes.plot(limit.at, np.maximum(limit.error, SMALLEST), color=BLUE, label="_error")
     axes.axhline(limit.tolerance, color=RED, ls="--", lw=1.2, label="_tolerance")

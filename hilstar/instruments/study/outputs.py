@@ -18,7 +18,7 @@ from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.simulate.pictures import write_exposure_fits
 from hilstar.instruments.simulate.simulator import Exposure, FrameNoise, Simulator
-from hilstar.instruments.study.fields import FIELDS, Field, fields_of
+from hilstar.instruments.study.fields import FIELDS, SkyField, fields_of
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.tracker.settings import DetectorSettings
@@ -41,14 +41,14 @@ FIGURES = {"orion": "5.3 to 5.7", "lyra": "5.8 to 5.12", "rosetta": "5.14 to 5.1
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class OutputScene:
     """A field before a camera: the stem of its files, its title, and the star of its zoom (None:
     the brightest).
     """
 
     stem: str
     title: str
-    field: Field
+    field: SkyField
     zoom_hip: int | None = None
 
 
@@ -81,7 +81,7 @@ def run(
     lines = []
     if file is not None:
         for field in fields_of(radec_roll_deg):
-            scene = Scene(field.stem, f"{field.name}, {file.path.name}", field)
+            scene = OutputScene(field.stem, f"{field.name}, {file.path.name}", field)
             lines.append(_output(directory, file, scene))
         return lines
     for field in FIELDS:
@@ -90,9 +90,11 @@ def run(
         mended = f"{field.name} with the thesis's errors mended"
         stem = field.stem + PUBLISHED
         bench = thesis_bench(f"thesis-{field.stem}-as-published.toml")
-        lines.append(_output(directory, bench, Scene(stem, published, field, field.zoom_hip)))
+        lines.append(_output(directory, bench, OutputScene(stem, published, field, field.zoom_hip)))
         bench = thesis_bench(f"thesis-{field.stem}.toml")
-        lines.append(_output(directory, bench, Scene(field.stem, mended, field, field.zoom_hip)))
+        lines.append(
+            _output(directory, bench, OutputScene(field.stem, mended, field, field.zoom_hip))
+        )
     return lines
 
 
@@ -101,7 +103,7 @@ def thesis_bench(name: str) -> BenchFile:
     return read_bench_file(resource_path("configs", name))
 
 
-def output_files(fields: tuple[Field, ...]) -> list[str]:
+def output_files(fields: tuple[SkyField, ...]) -> list[str]:
     """The names of all files that `run` writes of a bench."""
     endings = (".png", ".svg", ".csv", ".fits", f"{WITHOUT_NOISE}.fits")
     names = []
@@ -118,7 +120,7 @@ def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float
     return math.sqrt(light_e + dark_e + fixed_e2 + readout_e2)
 
 
-def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
+def _output(directory: Path, file: BenchFile, scene: OutputScene) -> str:
     """Expose a scene and write its files; a line about it."""
     noise = FrameNoise(seed=SEED)
     with Simulator(file) as simulator:
@@ -201,7 +203,7 @@ def _angle_deg(rays: FloatArray) -> float:
     return math.degrees(math.acos(float(np.clip(first @ last, -1, 1))))
 
 
-def _figure(path: Path, scene: Scene, outputs: Outputs) -> None:
+def _figure(path: Path, scene: OutputScene, outputs: Outputs) -> None:
     """The seven outputs of a scene."""
     saturated = int(outputs.truth["clipped"].sum()) or "none"
     stars = int(outputs.inside.sum())
@@ -240,7 +242,7 @@ def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> No
     axes.set(xlabel="star", title=title, ylabel=f"{name} [{unit}]")
 
 
-def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
+def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> None:
     """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
     low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
@@ -266,7 +268,7 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
     )
 
 
-def _zoom(scene: Scene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
+def _zoom(scene: OutputScene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
     """The name and place of the star in a zoom's middle; without one the image's middle."""
     stars = outputs.truth[outputs.inside]
     if scene.zoom_hip is not None:

@@ -19,7 +19,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S
 from hilstar.instruments.study.engine import ChartFinding, write_columns, write_findings
-from hilstar.instruments.study.fields import Field, fields_of
+from hilstar.instruments.study.fields import SkyField, fields_of
 from hilstar.instruments.study.study_benches import study_optics
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
@@ -81,7 +81,7 @@ class FieldRatios:
     model's.
     """
 
-    field: Field
+    field: SkyField
     star: npt.NDArray[np.intp]
     ratio: FloatArray
 
@@ -207,7 +207,7 @@ def _stars_by(file: BenchFile, brightness: Literal["dgs", "ags"]) -> Stars:
     return bench_stars(structs.replace(file.config, sky=sky), file.folder)
 
 
-def _in_field(field: Field, stars: Stars, ratio: FloatArray, camera: Camera) -> FieldRatios:
+def _in_field(field: SkyField, stars: Stars, ratio: FloatArray, camera: Camera) -> FieldRatios:
     """The stars whose centre is on the image."""
     to_image = camera.cam_to_image @ to_matrix(from_radec_roll_deg(*field.radec_roll_deg))
     near = stars.near(to_image[2], camera.field_radius_rad(0.0))

@@ -211,7 +211,7 @@ def place_rows(count: int) -> list[RigFigure]:
 
 
 def pixel_errors(bench: Bench, turn: CameraTurn) -> FloatArray:
-    """The distances (2, n), px, from a field's stars to the middles of the pixels they fall into."""
+    """The distances (2, n), px, from a field's stars to the middles of their pixels."""
     sprites = turning_sprites(bench, turn)
     places = np.stack([sprites.x_px, sprites.y_px])
     size_px = np.array(bench.camera.resolution_px)[:, None]

@@ -37,7 +37,7 @@ Judged = tuple[list[str], bool | None]
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """The cores that other processes used while times were taken, and what to say about such times."""
+    """The cores that other processes used while times were taken, and what to say of the times."""
 
     cores: float = 0.0
 

@@ -93,7 +93,7 @@ def answers_among(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
 
 
 def is_allowed(row: CombinationRow, given: Given) -> bool:
-    """Whether a choice is possible with what the bench and the sender give. Given rates are used."""
+    """Whether a choice is possible with what bench and sender give. Given rates are used."""
     if row.bit_stealing == "true" and not given.primaries:
         return False
     by_rate = row.prediction == "rate"
@@ -199,7 +199,7 @@ def turn_lines(
     scenes: Sequence[Sequence[CombinationRow]],
     budget: Sequence[ErrorPart],
 ) -> list[str]:
-    """A line for each turn at which another step becomes the largest part, and what to do about it."""
+    """A line for each turn at which another step becomes the largest part, and what to do."""
     lines = []
     last = ""
     for rows in scenes:

@@ -83,7 +83,7 @@ def filled_timeline(
 
 
 @dataclass(frozen=True, slots=True)
-class Combination:
+class ChainCombination:
     """One choice for each step.
 
     Depth: `bit_stealing`, and the catalogue's `faintest_v_mag`. `sprite`: `full`, `cut` as
@@ -99,13 +99,17 @@ class Combination:
     prediction: Prediction = "rate"
 
 
-def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> list[Combination]:
+def combinations(
+    turns: bool, can_steal_bits: bool, faintest_v_mag: float
+) -> list[ChainCombination]:
     """All combinations that are measured, for a scene that turns or one at rest."""
-    chosen: list[Combination] = []
+    chosen: list[ChainCombination] = []
     shallow = faintest_v_mag - SHALLOWER_MAG
     for stealing in (False, True) if can_steal_bits else (False,):
         for method in QUANTISATIONS:
-            chosen += [Combination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES]
+            chosen += [
+                ChainCombination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES
+            ]
             if turns:
                 crude: list[tuple[Smear, Prediction]] = [
                     ("point", "rate"),
@@ -113,11 +117,14 @@ def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> li
                     ("point", "held"),
                 ]
                 chosen += [
-                    Combination(method, stealing, faintest_v_mag, "cut", *ways) for ways in crude
+                    ChainCombination(method, stealing, faintest_v_mag, "cut", *ways)
+                    for ways in crude
                 ]
-        chosen += [Combination(method, stealing, shallow, "cut") for method in ("round", "exact")]
+        chosen += [
+            ChainCombination(method, stealing, shallow, "cut") for method in ("round", "exact")
+        ]
         if turns:
-            chosen.append(Combination("round", stealing, shallow, "cut", "point", "held"))
+            chosen.append(ChainCombination("round", stealing, shallow, "cut", "point", "held"))
     return chosen
 
 
@@ -253,11 +260,11 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """The named combinations: hilstar's defaults, `effort = "auto"`, and the bench file as it is."""
+    """The named combinations: hilstar's defaults, `effort = "auto"`, and the bench file's own."""
 
-    default: Combination
-    auto: Combination
-    as_filed: Combination
+    default: ChainCombination
+    auto: ChainCombination
+    as_filed: ChainCombination
 
 
 class Parts(Closing):
@@ -286,7 +293,7 @@ class Parts(Closing):
         self.own = self._with(OWN)
         self.can_steal_bits = self.own.calibration.can_steal_bits
 
-    def bench(self, combination: Combination) -> Bench:
+    def bench(self, combination: ChainCombination) -> Bench:
         """The bench that draws a combination."""
         render = self._file.config.render
         keys: dict[str, Any] = {
@@ -329,7 +336,7 @@ class Parts(Closing):
             self._chosen(self._with({}), movement, ahead),
         )
 
-    def _chosen(self, bench: Bench, movement: Movement, ahead: bool) -> Combination:
+    def _chosen(self, bench: Bench, movement: Movement, ahead: bool) -> ChainCombination:
         render = bench.config.render
         motion_px = (
             abs(movement.rate_deg_s)
@@ -345,7 +352,7 @@ class Parts(Closing):
         if render.quantisation == "auto":
             raise AssertionError("the effort's plan has chosen")
         sprite: Sprite = "cut" if render.effort == "auto" else "full"
-        return Combination(
+        return ChainCombination(
             render.quantisation, render.bit_stealing, self.faintest_v_mag, sprite, smear, prediction
         )
 

@@ -58,7 +58,7 @@ class DrawingChain:
     far.
     """
 
-    combination: choices.Combination
+    combination: choices.ChainCombination
     bench: Bench
     movement: Movement
     timed_frames: int = 0
@@ -159,7 +159,7 @@ QUICK = Rounds(exposures=1, time_s=0.5)
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """The rms error of a combination: of each star, arcsec and mag, and of the attitude they give."""
+    """The rms error of a combination: of each star, arcsec and mag, and of their attitude."""
 
     stars: int
     lost: int
@@ -288,7 +288,9 @@ class SceneMeasurement:
         """The stars that are judged, over all exposures."""
         return sum(len(judge) for judge in self.judges)
 
-    def chain(self, combination: choices.Combination, exposure_number: int = 0) -> DrawingChain:
+    def chain(
+        self, combination: choices.ChainCombination, exposure_number: int = 0
+    ) -> DrawingChain:
         """A combination with the movement of one exposure."""
         return DrawingChain(
             combination, self.parts.bench(combination), self.judges[exposure_number].movement
@@ -327,7 +329,7 @@ class SceneMeasurement:
             **asdict(taken),
         )
 
-    def error(self, combination: choices.Combination) -> Error:
+    def error(self, combination: choices.ChainCombination) -> Error:
         """A combination's error over all exposures."""
         star_errors = []
         turns = []
@@ -408,7 +410,7 @@ def rounded(value: float) -> float:
     return value
 
 
-def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
+def error_budget(scene: SceneMeasurement, combination: choices.ChainCombination) -> list[ErrorPart]:
     """The parts of the error of `auto`'s combination: STEPS, then RSS and WHOLE."""
     # by exposure: what is measured in the sky itself, then behind each step
     measured_by_step = []
@@ -435,7 +437,7 @@ def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> l
 
 
 def _lights(
-    scene: SceneMeasurement, combination: choices.Combination, number: int
+    scene: SceneMeasurement, combination: choices.ChainCombination, number: int
 ) -> Iterator[FloatArray]:
     """The mean light (H, W) of an exposure after each of STEPS."""
     chain = scene.chain(combination, number)

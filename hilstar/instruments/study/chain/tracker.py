@@ -263,7 +263,7 @@ class StarJudge:
         return MeasuredStars(directions, np.where(is_lit, total, 0.0))
 
     def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
-        """Whether the neighbourhood of places on the tracker is on the detector and on the monitor."""
+        """Whether the surroundings of places are on the detector and on the monitor."""
         tracker = self.tracker
         on_detector = within(x_px, y_px, tracker.camera.resolution_px, margin_px)
         monitor_x, monitor_y = tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel())

@@ -155,7 +155,7 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
 
 
 def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
-    """The installed methods, imported and compiled; and for each of the others how to install it."""
+    """The installed methods, imported and compiled; and how to install each of the others."""
     draws: dict[str, Draw] = {}
     missing: dict[str, str] = {}
     for name, _, make in METHODS:
@@ -480,8 +480,8 @@ def _seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def _spread(times_ms: list[float]) -> report.Spread:
-    return report.Spread(float(np.median(times_ms)), min(times_ms), max(times_ms))
+def _spread(times_ms: list[float]) -> report.TimeSpread:
+    return report.TimeSpread(float(np.median(times_ms)), min(times_ms), max(times_ms))
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import Levels, Response, srgb_response
 from hilstar.instruments.study.codes import AIMS
-from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.instruments.study.stability import CaseFigures, FailureCase
 from hilstar.optics.psf import MAX_CUT, SQRT2, GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
@@ -231,7 +231,7 @@ def narrow_star() -> FailureCase:
         f"flux off by {ours.flux:.1e}; centre of gravity by {own_places}",
         "the Gaussian is integrated over pixels; pixels of any display keep that centroid error:"
         " write 0.5 px or more",
-        Figures(ours.flux, sampled.flux, FLUX_ERROR),
+        CaseFigures(ours.flux, sampled.flux, FLUX_ERROR),
     )
 
 
@@ -258,7 +258,7 @@ def wide_star() -> FailureCase:
         f"a pixel off by up to {100 * fault:.0f} % of the peak",
         f"{error:.0e} of the peak; the star's flux off by {image.sum() - 1:+.0e}",
         "float32 differences are small against the flux, and their errors cancel in the sum",
-        Figures(error, fault, PEAK_ERROR),
+        CaseFigures(error, fault, PEAK_ERROR),
     )
 
 
@@ -275,7 +275,7 @@ def negative_wings() -> FailureCase:
         f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's",
         f"{error} negative pixels",
         "the shader takes the larger of difference and 0",
-        Figures(float(error), float(fault), NOTHING),
+        CaseFigures(float(error), float(fault), NOTHING),
     )
 
 
@@ -293,7 +293,7 @@ def floored_wings() -> FailureCase:
         f"adds {100 * fault:.1f} % to each star, over {width} x {height} pixels",
         f"flux off by {error:.0e}",
         "no floor: outside its footprint a star has no light",
-        Figures(error, fault, FLUX_ERROR),
+        CaseFigures(error, fault, FLUX_ERROR),
     )
 
 
@@ -319,7 +319,7 @@ def absurd_sigmas() -> FailureCase:
         f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
         f"refused: {' | '.join(refusals)}",
         "a point of GL is a star's footprint",
-        Figures(silently_cut, max(cuts), MAX_CUT),
+        CaseFigures(silently_cut, max(cuts), MAX_CUT),
     )
 
 
@@ -336,7 +336,7 @@ def star_on_pixel_edge() -> FailureCase:
         f"centre {fault_px:.2f} px off, to either side",
         f"centre {off_px:.0e} px off",
         "light goes to both pixels; place is whole pixel and float32 fraction",
-        Figures(off_px, fault_px, CENTROID_PX),
+        CaseFigures(off_px, fault_px, CENTROID_PX),
     )
 
 
@@ -365,7 +365,7 @@ def star_on_image_edge() -> FailureCase:
         f"up to {100 * fault:.0f} % of its light too much or too little",
         f"light on the image off by {error:.0e} of the star's",
         "a star is drawn where its footprint touches the image, and cut there",
-        Figures(error, fault, FLUX_ERROR),
+        CaseFigures(error, fault, FLUX_ERROR),
     )
 
 
@@ -407,7 +407,7 @@ def many_stars() -> FailureCase:
         f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x"
         f" {CORNER_PX}",
         "the GPU blends every sprite, in float32",
-        Figures(max(error, pixel_error), fault, CROWD_ERROR),
+        CaseFigures(max(error, pixel_error), fault, CROWD_ERROR),
     )
 
 
@@ -434,7 +434,7 @@ def flux_range() -> FailureCase:
         f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone",
         f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}",
         "float32, and each star in its own footprint",
-        Figures(max(errors), max(faults), FLUX_ERROR),
+        CaseFigures(max(errors), max(faults), FLUX_ERROR),
     )
 
 
@@ -500,7 +500,7 @@ def popping() -> FailureCase:
         f"its light varies by {100 * fault:.1f} %",
         f"varies by {error:.1e} in the linear image",
         "integrated over pixels, and cut where 1e-6 of the light remains",
-        Figures(error, fault, RIPPLE),
+        CaseFigures(error, fault, RIPPLE),
     )
 
 
@@ -515,7 +515,7 @@ def popping_codes() -> FailureCase:
         f"its light varies by {fault:.3f} mag",
         f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
         "round adds up the errors of its pixels; exact chooses a star's codes together",
-        Figures(error, fault, AIMS[CODES_BITS][0]),
+        CaseFigures(error, fault, AIMS[CODES_BITS][0]),
     )
 
 
@@ -648,7 +648,7 @@ def judged(
         f"a star's light off by {fault:.2g} of the panel's smallest steps rms",
         f"by {error:.2g} steps",
         why,
-        Figures(error, fault, steps_a_star * scene.stars),
+        CaseFigures(error, fault, steps_a_star * scene.stars),
     )
 
 
@@ -724,7 +724,7 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
         " handed on",
         f"no pixel has more than {error:.1e} of white too much",
         "what is over white is lost, and told; no neighbour makes up for it",
-        Figures(error, fault, largest_step),
+        CaseFigures(error, fault, largest_step),
     )
 
 
@@ -765,7 +765,7 @@ def no_stars() -> FailureCase:
         f"{no_number:.0f} % of the pixels are no number",
         f"{100 * error:.0f} % of the pixels are lit",
         "full scale is the bench's, whatever a frame has",
-        Figures(error, float(scaled.sum()), NOTHING),
+        CaseFigures(error, float(scaled.sum()), NOTHING),
     )
 
 

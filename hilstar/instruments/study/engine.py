@@ -8,7 +8,7 @@ what was measured, and the law that foretells it. A panel has lines and points (
 bars (`BarSpec`), or some values of each row on a line of its own (`DotsSpec`).
 
 Methods with an error and a time are `Trials` (trials.py); a method that fails is a `FailureCase`
-(stability) or a `Limit` (limits.py); curves over one x are `CurvePanel`s, with no rows at all.
+(stability) or a `StressLimit` (limits.py); curves over one x are `CurvePanel`s, without rows.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -269,8 +269,8 @@ def draw_rows(
 def row_panels(
     path: Path, finding: str, spec: ChartSpec, rows: Sequence[Any], load: Load = IDLE
 ) -> "Iterator[list[Axes]]":
-    """The panels of a chart of rows, for what a ChartSpec does not have; the chart is written when
-    the context ends.
+    """Draw a chart of rows, and yield its panels for what a ChartSpec cannot say. The chart is
+    written when the context ends.
     """
     down = len(spec.panels) // spec.columns
     note = load.note(spec.note)
@@ -294,7 +294,7 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
 
 
 def draw_line(axes: "Axes", line: LineSpec, look: SeriesLook, series: Sequence[Any]) -> None:
-    """Draw what a line has of the rows of one series; nothing where it has none."""
+    """Draw one line of the rows of one series; nothing where no row belongs to it."""
     rows = [row for row in series if isinstance(row, line.of) and holds(line.where, row)]
     if not rows:
         return
@@ -364,7 +364,7 @@ def finish_panel(axes: "Axes", panel: PanelSpec) -> None:
 
 
 def set_scales(axes: "Axes", panel: PanelSpec) -> None:
-    """Set the scales, limits and ticks of a panel; what it does not state stays as it is."""
+    """Set the scales, limits and ticks that a panel states."""
     x_scale, y_scale = panel.scales
     # What a panel draws may have set a scale of its own.
     if x_scale != "linear":
@@ -389,7 +389,7 @@ def set_scales(axes: "Axes", panel: PanelSpec) -> None:
 
 
 def holds(where: Where | None, row: Any) -> bool:
-    """Whether a row is of those that are drawn."""
+    """Whether a row is drawn."""
     return where is None or where(row)
 
 
@@ -406,7 +406,7 @@ def at_least(name: str, floor: float) -> Callable[[Any], float]:
 
 
 def finite(name: str, below: float = np.inf) -> Callable[[Any], float]:
-    """A field, and NaN, which is not drawn, from `below` on."""
+    """A field; NaN, which is not drawn, where it is `below` or more."""
 
     def value(row: Any) -> float:
         size = float(getattr(row, name))

@@ -168,9 +168,7 @@ class CatalogueFigure:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredValue:
-    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are
-    drawn.
-    """
+    """A figure of the catalogue's stars (n,), its axis's label, and the drawn limits."""
 
     of_star: FloatArray
     label: str
@@ -251,7 +249,7 @@ def draw_catalogue_errors(
 
 
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
-    """The figure that each error of table 2.3 belongs to, by the error's name."""
+    """The catalogue's figure behind each error of table 2.3, by the error's name."""
     pm_ra = catalog.pm_ra_cosdec_mas_yr
     pm_dec = catalog.pm_dec_mas_yr
     return {
@@ -265,14 +263,14 @@ def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
 
 
 def density() -> "Colormap":
-    """From clear to blue, on light pages and on dark ones."""
+    """A colour map from clear to blue, for light and dark pages."""
     from matplotlib.colors import LinearSegmentedColormap, to_rgba
 
     return LinearSegmentedColormap.from_list("density", [to_rgba(BLUE, 0.06), to_rgba(BLUE, 1.0)])
 
 
 def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) -> None:
-    """The median of an error over the sky, which Hipparcos scanned about the ecliptic's poles."""
+    """A map of the median of an error; Hipparcos scanned the sky about the ecliptic's poles."""
     ra_edges = np.linspace(0, 360, 73)
     dec_edges = np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
     column = np.digitize(catalog.ra_deg, ra_edges) - 1
@@ -510,20 +508,20 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
 
 @dataclass(frozen=True, slots=True)
 class SpectrumErrors:
-    """The error of the electron rate of a sensor by one method, %, of all library stars (n,)."""
+    """The errors (n,) of the electron rates of library stars by one method and sensor, %."""
 
     sensor: str
     method: str
     percent: FloatArray
 
     def within(self, stars: BoolArray) -> tuple[float, float]:
-        """What half of some stars are within, and 95 % of them, %."""
+        """The errors that half and 95 % of some stars are within, %."""
         half, at_95 = np.percentile(np.abs(self.percent[stars]), (50, 95)).tolist()
         return half, at_95
 
 
 def spectrum_errors() -> list[SpectrumErrors]:
-    """Each sensor by each method: spectra held out in turn, and black bodies."""
+    """Every sensor by every method: held-out spectra, and black bodies."""
     library = load_library()
     photometry = Photometry()
     rows = []
@@ -692,10 +690,10 @@ def setting_words(row: ZeroPointRow) -> str:
 
 def names_with(figures: Mapping[str, tuple[float, float]], form: str) -> str:
     """Names with their two figures, as `form` writes them, in one line."""
-    words = []
+    named = []
     for name, (half, most) in figures.items():
-        words.append(form.format(name=name.split()[-1], half=half, most=most))
-    return ", ".join(words)
+        named.append(form.format(name=name.split()[-1], half=half, most=most))
+    return ", ".join(named)
 
 
 def temperature_scales(directory: Path) -> ChartFinding:
@@ -803,13 +801,13 @@ def choices(directory: Path) -> ChartFinding:
 
 
 def cost_label(name: str, paid: Mapping[str, tuple[float, float]]) -> str:
-    """A choice with what half of the stars pay for it, and a twentieth."""
+    """A choice, what half of the stars pay for it, and what a twentieth pays."""
     half, most = paid[name]
     return f"{name.rsplit(maxsplit=1)[-1]}: {half:.2f} ({most:.2f})"
 
 
 def star_costs_mag(stars: Catalog, optics: Optics) -> dict[str, FloatArray]:
-    """The cost of each choice for stars (n,), mag; real spectra among them."""
+    """The cost of each choice for stars (n,), mag, that of real spectra included."""
     table = tabulate_pickles(optics, Photometry())
     real = table.electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
     # a spectrum for each colour, of which there are few
@@ -824,7 +822,7 @@ def star_costs_mag(stars: Catalog, optics: Optics) -> dict[str, FloatArray]:
 
 
 def choices_finding(paid: Mapping[str, tuple[float, float]]) -> str:
-    """Which choice changes half of the stars most, and which a twentieth; mag (2,) by choice."""
+    """The choice that changes half of the stars most, and the one that changes a twentieth most."""
     dearest = max(paid, key=lambda name: paid[name][0])
     for_few = max(paid, key=lambda name: paid[name][1])
     half, most = paid[dearest]

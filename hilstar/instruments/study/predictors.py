@@ -32,8 +32,9 @@ AttitudeAt = Callable[[int], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Predictor:
-    """A way to the attitude at a time: `load` takes the last samples, which for one that `waits`
-    end after that time.
+    """A way to the attitude at a time: `load` takes the last samples.
+
+    Those of one that `waits` end after that time.
     """
 
     name: str
@@ -43,9 +44,7 @@ class Predictor:
 
 
 def predictors() -> tuple[Predictor, ...]:
-    """Every way; the default is hilstar's timeline as a bench file that says nothing sets it,
-    fed with rates.
-    """
+    """Every way. The default is hilstar's timeline with a bench file's defaults, fed with rates."""
     settings = AttitudeSettings()
     bench_policy = Policy(
         round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS)
@@ -96,8 +95,9 @@ def shaken(
 
 
 def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
-    """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz,
-    0.0003 arcsec predicted.
+    """The rate (3,) of a movement by differences over RATE_STEP_NS on both sides.
+
+    It is 0.006 arcsec/s off at 37 Hz, which is 0.0003 arcsec of a predicted attitude.
     """
     before = attitude(t_ns - RATE_STEP_NS)
     after = attitude(t_ns + RATE_STEP_NS)
@@ -106,8 +106,8 @@ def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and, where it
-    is `shaken`, JITTER on it.
+    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a steady turn about AXIS, and JITTER
+    where it is `shaken`.
 
     A camera at rest is not shaken.
     """
@@ -171,7 +171,7 @@ def _timeline(
 
 
 def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
-    """The newest sample's rate, and the change since the one before it carried on."""
+    """Extrapolation by the newest rate and its change since the sample before."""
     (before_ns, before), (newest_ns, newest) = (
         (s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:]
     )
@@ -186,7 +186,7 @@ def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
 
 
 def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:
-    """The samples' turns from the newest one, as a cubic carried on past it."""
+    """Extrapolation of a cubic through the samples' turns from the newest one."""
     newest = near[-1]
 
     def predicted(t_ns: int) -> FloatArray:

@@ -37,7 +37,7 @@ Judged = tuple[list[str], bool | None]
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """The cores that others took while times were taken, and what to say of such times."""
+    """The cores that other processes used while times were taken, and what to say of the times."""
 
     cores: float = 0.0
 
@@ -48,7 +48,7 @@ class Load:
 
     @property
     def caution(self) -> str:
-        """The line about times that were taken beside other work."""
+        """The line about times taken beside other work."""
         return (
             f"a busy machine: other processes took {self.cores:.1f} of its {os.cpu_count()} cores"
             " meanwhile, so these times name no winner; run it again when the machine is idle"
@@ -122,7 +122,7 @@ def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dic
 def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
     """Whether the method of a row is beaten by that of a column, (n, n).
 
-    A method beats another whose error and time are both no smaller, and one of them larger.
+    A method is beaten by another whose error and time are both no larger, and one of them smaller.
     """
     error = np.asarray(errors, dtype=np.float64)
     taken = np.asarray(times_ms, dtype=np.float64)
@@ -138,8 +138,8 @@ def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
 
 
 class OtherWork:
-    """Counts the cores that other processes take from its creation on; children of this process
-    are its own.
+    """Counts the cores that other processes use from now on; this process's children are not
+    others.
     """
 
     def __init__(self) -> None:
@@ -157,7 +157,7 @@ class OtherWork:
         return 0.0
 
     def load(self) -> Load:
-        """What the others took since creation."""
+        """The use by others since creation."""
         return Load(self.cores())
 
     @staticmethod

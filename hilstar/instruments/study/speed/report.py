@@ -24,7 +24,7 @@ LABELS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class TimeSpread:
     """Times of a work, ms."""
 
     median: float
@@ -60,14 +60,14 @@ class MethodTiming(Cell):
 
     method: str
     kind: str
-    ms: Spread
+    ms: TimeSpread
 
 
 @dataclass(frozen=True, slots=True)
 class PythonTime(Cell):
     """How long all of a frame takes that is not OpenGL."""
 
-    ms: Spread
+    ms: TimeSpread
 
 
 @dataclass(frozen=True, slots=True)

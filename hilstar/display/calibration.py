@@ -388,9 +388,6 @@ class CalibrationFile(Table, frozen=True):
     monitor_identity: MonitorIdentity | None = None
 
 
-KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
-
-
 def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYTES) -> str:
     """The text of a file. Its bytes are appended to `read`, from which the calibration's hash is
     made.
@@ -425,7 +422,8 @@ def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
     try:
         return msgspec.convert(tables, CalibrationFile)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
+        kind = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
+        raise InputError(f"{path}: {explained(str(error), tables, kind)}") from error
 
 
 def _table(path: Path, read: list[bytes] | None) -> TextTable:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from hilstar.basics.arrays import Float32Array, IntArray
 from hilstar.basics.units import COMPUTE_VERSION
 from hilstar.display import quantise
-from hilstar.display.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, Weights
+from hilstar.display.balance import AS_USUAL, SUMS, Balance, Seen, Weights
 from hilstar.display.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
 from hilstar.display.panel import Panel
 from hilstar.display.response import Levels
@@ -59,9 +59,6 @@ class Turn(NamedTuple):
     def kept(self) -> int:
         """How many choices are kept side by side."""
         return KEPT_BEFORE if self.is_followed else KEPT
-
-
-ALONE = Turn()
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +118,10 @@ class ExactQuantiser(quantise.Quantiser):
     )
     shader = "exact.comp"
     other_codes = 1e-2
-    weights: ClassVar[Weights] = IN_A_FRAME
+    weights: ClassVar[Weights] = Weights()
     remembers: ClassVar[bool] = False
     left: Left | None = None
-    turn: Turn = ALONE
+    turn: Turn = Turn()
     before: Sequence["ExactQuantiser"] = ()  # of the panels before, as in `turn`
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 

@@ -145,7 +145,17 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     of_air = disc.distance_radii, disc.air_radii, disc.slant_depth, whole.spread
     inner = _inner(region, drawn)
     if inner is None:
-        return Tiles((first_x, first_y, 0, 0), *[NOTHING] * 7, of_air)
+        return Tiles(
+            (first_x, first_y, 0, 0),
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            of_air,
+        )
     drawn &= ~white
     # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile
     # by tile.

@@ -122,17 +122,17 @@ def places_before(before: IntArray | None, star: IntArray) -> IntArray:
     if before is None or not len(before) or not len(star):
         return np.full(len(star), NONE_BEFORE, dtype=np.int32)
     order = np.argsort(before, kind="stable")
-    star_places = np.maximum(np.searchsorted(before[order], star, side="right") - 1, 0)
-    return np.where(before[order[star_places]] == star, order[star_places], NONE_BEFORE).astype(
-        np.int32
-    )
+    last = np.searchsorted(before[order], star, side="right") - 1
+    place = order[np.maximum(last, 0)]
+    is_there = before[place] == star
+    return np.where(is_there, place, NONE_BEFORE).astype(np.int32)
 
 
 def first_phases(star: IntArray, before: IntArray) -> Float32Array:
     """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were
     there before.
     """
-    turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(
-        np.float64
-    ) / 2**32 - 0.5
-    return np.where(before == NONE_BEFORE, turned, 0.0).astype(np.float32)
+    product = star.astype(np.uint64) * np.uint64(GOLDEN)
+    low_bits = product & np.uint64(0xFFFFFFFF)
+    phase = low_bits.astype(np.float64) / 2**32 - 0.5
+    return np.where(before == NONE_BEFORE, phase, 0.0).astype(np.float32)

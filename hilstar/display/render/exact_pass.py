@@ -36,9 +36,13 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
-PARTS = tuple(
-    f"{one}.glsl"
-    for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")
+PARTS = (
+    "floor.glsl",
+    "exact/inputs.glsl",
+    "shares.glsl",
+    "exact/stars.glsl",
+    "exact/pixels.glsl",
+    "exact/choices.glsl",
 )
 LOCAL_SIZE = 32  # as in exact.comp
 TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 3, 7, 8
@@ -287,9 +291,9 @@ class Memory:
         self._ctx = ctx
         self._star: IntArray | None = None  # the last frame's stars
         self._room = 0
-        self._begins, self._before, self._left = (
-            self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,))
-        )
+        self._begins = self._reserved(BEGIN_DTYPE.itemsize)
+        self._before = self._reserved(SUMS_BYTES)
+        self._left = self._reserved(SUMS_BYTES)
 
     def _reserved(self, size: int) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=max(self._room, 1) * size, dynamic=True)
@@ -312,10 +316,9 @@ class Memory:
             self._left.release()
             self._left = self._reserved(SUMS_BYTES)
         self._begins.write(begins)
-        for place, buffer in enumerate(
-            (self._begins, self._before, self._left), start=FIRST_BINDING
-        ):
-            buffer.bind_to_storage_buffer(place)
+        self._begins.bind_to_storage_buffer(FIRST_BINDING)
+        self._before.bind_to_storage_buffer(FIRST_BINDING + 1)
+        self._left.bind_to_storage_buffer(LEFT_BINDING)
         self._star = star.copy()
 
     @property
@@ -323,9 +326,8 @@ class Memory:
         """The errors of the last frame, read back; None at the beginning of a sequence."""
         if self._star is None:
             return None
-        sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(
-            -1, SUMS
-        )
+        data = self._left.read(len(self._star) * SUMS_BYTES)
+        sums = np.frombuffer(data, dtype="<f4").reshape(-1, SUMS)
         return Left(self._star, np.ascontiguousarray(sums.T))
 
     @left.setter
@@ -344,10 +346,10 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     bits each, then the pixel's shares of the 3 x 3 and the 5 x 5 box in 10 bits each.
     """
     x, y = order.places()
-    away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
-    box_3, box_5 = (
-        np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5)
-    )
+    middle_x, middle_y = np.rint(order.phases)
+    away = x - middle_x[:, None], y - middle_y[:, None]
+    box_3 = np.rint(balance.in_box(3, *away) * IN_BOX).astype(np.intp)
+    box_5 = np.rint(balance.in_box(5, *away) * IN_BOX).astype(np.intp)
     packed = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
     return np.asarray(packed, dtype=np.uint32)
 
@@ -363,10 +365,13 @@ def overrated(width_px: tuple[float, float]) -> float:
     if min(width_px) < NARROW_PX:
         return OVERRATED
     away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
-    along_x, along_y = (_largest_ratios(away, width) for width in width_px)
+    along_x = _largest_ratios(away, width_px[0])
+    along_y = _largest_ratios(away, width_px[1])
+    # how far along y a pixel within reach may be
     rest = np.sqrt(REACH_SIGMA**2 - away**2)
-    along_rest = along_y[np.searchsorted(away, rest, side="right") - 1]
-    return OVERRATED * float((along_x * along_rest).max())
+    last = np.searchsorted(away, rest, side="right") - 1
+    ratios = along_x * along_y[last]
+    return OVERRATED * float(ratios.max())
 
 
 def _largest_ratios(places: FloatArray, width_px: float) -> FloatArray:
@@ -380,8 +385,10 @@ def _ratio(place: float, width_px: float) -> float:
     `place` wide sigmas off.
     """
     wide = math.sqrt(width_px**2 + PIXEL_VARIANCE)
-    edges = [(place * wide + side) / (width_px * math.sqrt(2)) for side in (-0.5, 0.5)]
-    light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
+    scale = width_px * math.sqrt(2)
+    below = math.erf((place * wide - 0.5) / scale)
+    above = math.erf((place * wide + 0.5) / scale)
+    light = (above - below) / 2
     return math.exp(-(place**2) / 2) / (math.sqrt(math.tau) * wide * light)
 
 
@@ -393,11 +400,13 @@ def stretches_of(star: IntArray) -> IntArray:
     ends = np.append(begins[1:], len(star))
     parts = -(-(ends - begins) // CARRIED)
     path = np.repeat(np.arange(len(begins)), parts)
-    number = np.arange(len(path)) - np.repeat(np.cumsum(parts) - parts, parts)
-    first = begins[path] + number * CARRIED
-    return np.stack(
-        [first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1
-    )
+    first_of_path = np.cumsum(parts) - parts
+    number = np.arange(len(path)) - np.repeat(first_of_path, parts)
+    path_begin = begins[path]
+    path_end = ends[path]
+    first = path_begin + number * CARRIED
+    end = np.minimum(first + CARRIED, path_end)
+    return np.stack([first, end, path_begin, path_end], axis=1)
 
 
 def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
@@ -411,11 +420,9 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
     runs = max(1, min(count // RUN, MAX_RUNS))
     # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows
     # by a pixel or two.
-    half_octaves = (electrons_per_s.view(np.int32) >> 22) - (
-        np.float32(step_e_per_s).view(np.int32) >> 22
-    )
-    key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(
-        half_octaves, 0, HALF_OCTAVES - 1
-    )
+    first_half_octave = np.float32(step_e_per_s).view(np.int32) >> 22
+    half_octaves = (electrons_per_s.view(np.int32) >> 22) - first_half_octave
+    run = np.arange(count) * runs // max(count, 1)
+    key = run * HALF_OCTAVES + np.clip(half_octaves, 0, HALF_OCTAVES - 1)
     # 16-bit keys are sorted by radix
     return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))

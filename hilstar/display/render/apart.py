@@ -91,8 +91,8 @@ class ApartBackend(Backend):
 
     def levels(self) -> Levels:
         """See `Backend.levels`."""
-        # Primary by primary in memory: a pixel's three levels side by side take five times as long
-        # to write, and who reads one primary's reads all of its pixels.
+        # Primary by primary in memory: a pixel's three side by side take 12 times as long to write,
+        # and the lit pixels of all three 25 times as long to find (1920 x 1080).
         by_primary = np.stack([panel.levels() for panel in self.panels])
         return Levels(np.moveaxis(by_primary, 0, -1))
 

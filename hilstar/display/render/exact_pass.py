@@ -121,11 +121,9 @@ class ExactPass:
         self._order = LookupTable(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
         self._light = LookupTable(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
         gain = panel.gain()
-        self._gain = (
-            None
-            if gain is None
-            else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
-        )
+        self._gain: moderngl.Texture | None = None
+        if gain is not None:
+            self._gain = ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._memory = Memory(ctx) if quantiser.remembers else None
         self._step_e_per_s = float(light[1])
         self._turns = ctx.buffer(reserve=4, dynamic=True)
@@ -138,11 +136,18 @@ class ExactPass:
         """The program for stars or paths, whose light is summed, on a `floor` of levels or not,
         or in the linear image.
         """
-        if (paths, summed, floor) in self._programs:
-            return self._programs[paths, summed, floor]
+        key = paths, summed, floor
+        if key not in self._programs:
+            program = self._build(paths, summed, floor)
+            self._shares.set(program)
+            for values in (self._reach(paths), self._light_of_panel(), self._weights()):
+                set_uniforms(program, values)
+            self._programs[key] = program
+        return self._programs[key]
+
+    def _build(self, paths: bool, summed: bool, floor: bool) -> moderngl.ComputeShader:
+        """The program, without the values of its uniforms."""
         order = self._pixels
-        panel = self._panel
-        balance = self._balance
         before = 0 if paths else len(self._before)
         defines = [
             f"NEAR {order.near}",
@@ -157,51 +162,61 @@ class ExactPass:
             *self._order.define,
             *self._light.define,
         ]
-        narrow = min(balance.psf.width_px) < NARROW_PX
-        uneven = self._gain is not None
         whether = {
             "LEAVES": self._turn.is_followed and not paths,
-            "NARROW": narrow,
+            "NARROW": min(self._balance.psf.width_px) < NARROW_PX,
             "PATHS": paths,
-            "UNIFORMITY": uneven,
+            "UNIFORMITY": self._gain is not None,
             "TEMPORAL": self._memory is not None,
             "SUMS": summed,
             "FLOOR": floor,
         }
         defines += [name for name, is_so in whether.items() if is_so]
         files = (*["sums.glsl"] * summed, *PARTS)
-        program = build_compute(self._ctx, self._quantiser.shader, defines, files)
-        self._shares.set(program)
-        window = balance.window_px
-        weights = balance.weights
-        values: dict[str, Any] = {
+        return build_compute(self._ctx, self._quantiser.shader, defines, files)
+
+    def _reach(self, paths: bool) -> dict[str, Any]:
+        """Uniforms: which pixels are a star's, and how many of them are chosen."""
+        order = self._pixels
+        psf = self._balance.psf
+        least_e_per_s = order.area_px2 * LEAST_LIGHT * float(self._panel.light_e_per_s()[1])
+        variance_x, variance_y = psf.variance_px2
+        return {
             "footprint": order.size**2,
-            "overrated": overrated(balance.psf.width_px) if paths else OVERRATED,
+            "overrated": overrated(psf.width_px) if paths else OVERRATED,
             "reach_px2": order.area_px2,
-            "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
+            "reach_per_e": 1 / least_e_per_s,
             "fewest": self._quantiser.fewest(order),
-            "white": panel.response.white,
-            "first_threshold_e_per_s": float(
-                panel.response.threshold[0] * panel.flux_at_white_e_per_s
-            ),
             "resolution_px": self._linear.size,
             "odd": order.bias,
-            "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
-            "half_inverse_spread2": tuple(0.5 / variance for variance in balance.psf.variance_px2),
+            "half_inverse_spread2": (0.5 / variance_x, 0.5 / variance_y),
+        }
+
+    def _light_of_panel(self) -> dict[str, Any]:
+        """Uniforms: the panel's levels, and the unit of its gain, which is bound there."""
+        panel = self._panel
+        threshold = panel.response.threshold[0]
+        return {
+            "white": panel.response.white,
+            "first_threshold_e_per_s": float(threshold * panel.flux_at_white_e_per_s),
+            "gain": 0,
+        }
+
+    def _weights(self) -> dict[str, Any]:
+        """Uniforms: the weights of the ten sums."""
+        balance = self._balance
+        weights = balance.weights
+        sigma_x, sigma_y = balance.window_px
+        of_all = weights.light, weights.moments
+        under_window = weights.window_light, weights.window_moments
+        return {
+            "half_inverse_window2": (0.5 / sigma_x**2, 0.5 / sigma_y**2),
             "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
             "follows": (*balance.follows(3), *balance.follows(5)),
-            "weights": (
-                weights.light,
-                weights.moments,
-                weights.window_light,
-                weights.window_moments,
-            ),
+            "weights": (*of_all, *under_window),
             "few_steps": weights.few_steps,
             "last_light": weights.last_light,
-        } | ({"gain": 0} if self._gain is not None else {})
-        set_uniforms(program, values)
-        self._programs[paths, summed, floor] = program
-        return program
+        }
 
     @property
     def left(self) -> Left | None:

@@ -100,10 +100,12 @@ def _places(
     """
     width, height = resolution_px
     step = np.arange(side) - (side - 1) // 2
-    place = np.add.outer(width * step, step).reshape(-1, 1) + (y * width + x)
+    in_square = np.add.outer(width * step, step).reshape(-1, 1)
+    place = in_square + (y * width + x)
     low = step[0]
     high = step[-1]
-    is_cut = (x + low < 0) | (x + high >= width) | (y + low < 0) | (y + high >= height)
+    is_cut = (x + low < 0) | (x + high >= width)
+    is_cut |= (y + low < 0) | (y + high >= height)
     if not is_cut.any():
         return place, None
     cut = np.flatnonzero(is_cut)
@@ -245,8 +247,10 @@ class CpuStars:
         """Which pixels (side, side, n) of squares lie within their stars' ellipses, as in
         splat.frag.
         """
-        away = squares.offset_px[:, None]
-        away_x, away_y = (np.abs(away - at) for at in squares.fraction_px)
+        offset_px = squares.offset_px[:, None]
+        x_px, y_px = squares.fraction_px
+        away_x = np.abs(offset_px - x_px)
+        away_y = np.abs(offset_px - y_px)
         up = away_y / np.maximum(reach_px[1], np.float32(LEAST_PX))
         wide = reach_px[0] * np.sqrt(np.maximum(1 - up * up, np.float32(0)))
         wide[away_y > reach_px[1]] = -1.0

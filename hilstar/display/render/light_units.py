@@ -57,14 +57,13 @@ class LightUnits:
         # what part of the light that lights a pixel the squares leave out beside them at most: one
         # in so many
         if sides:
-            outside = [
-                self.lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px))
-                for side in sides
-            ]
-            fewest = min(
-                [wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS
-            )
-            self.wings = SQUARE_WINGS * max(1.0, fewest)
+            fewest = []
+            for side in sides:
+                outside_e_per_s = side.below_e_per_s * psf.outside_share(side.side_px)
+                wings = self.lit_e_per_s / outside_e_per_s
+                if wings > ANY_RATE:
+                    fewest.append(wings)
+            self.wings = SQUARE_WINGS * max(1.0, min(fewest, default=WINGS / SQUARE_WINGS))
         self.side_px = max((side.side_px for side in sides), default=self._footprint_px)
 
     def unit_for(self, sprites: FrameLight | None) -> float | None:

@@ -42,6 +42,7 @@ from hilstar.display.render.encoder import (
     set_uniforms,
     splat_program,
     sprites_array,
+    viewport_of_sprites,
 )
 from hilstar.display.render.exact_pass import ExactPass, PixelSums
 from hilstar.display.render.light_units import LightUnits
@@ -334,11 +335,8 @@ class Renderer(Backend):
 
     def _draw_by_points(self, sprites: FrameLight | None, unit_e_per_s: float | None) -> None:
         """The linear image and its levels by rasterised sprites, in units where one is given."""
-        few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
-        if self._encoder is not None:
-            sides = self._lit_sides
-        else:
-            sides = ()
+        few_px = math.prod(self.target.resolution_px) // SPRITE_PIXEL_COST
+        sides = () if self._encoder is None else self._lit_sides
         if sprites is None:
             covered_px = 0
         else:
@@ -510,19 +508,14 @@ class Renderer(Backend):
                 self._buffer.orphan()
                 self._buffer.write(sprites.data)
             self._last_count = len(sprites)
-            width, height = self.target.resolution_px
-            margin = self.footprint_px
             with self._stage("splat"):
                 if not in_units:
                     self._splat["sides"] = 0 if whole else len(self._cut_sides)
                     self._splat["sprites_per_star"] = float(sprites.per_star)
                 self._linear_fbo.use()
                 self._shares.bind()
-                self._linear_fbo.viewport = (
-                    -margin,
-                    -margin,
-                    width + 2 * margin,
-                    height + 2 * margin,
+                self._linear_fbo.viewport = viewport_of_sprites(
+                    self.target.resolution_px, self.footprint_px
                 )
                 self._ctx.enable(moderngl.BLEND)
                 vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao

@@ -15,13 +15,12 @@ from typing import Any
 from hilstar.basics.process.closing import Closing
 from hilstar.display.window.output_settings import (
     IDENTITY,
-    NVIDIA,
     NVIDIA_ATTRIBUTES,
     OutputState,
     Pair,
-    Value,
     property_value,
 )
+from hilstar.display.window.property_rules import NVIDIA, Value
 from hilstar.display.window.x11 import (
     INT,
     NUMBER,

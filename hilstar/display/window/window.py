@@ -393,12 +393,11 @@ class Window(Closing):
         """
         if self.display is None:
             return None
-        same = (
-            d.name
-            for d in _displays()
-            if d.name != self.display.name and d.position_px == self.display.position_px
-        )
-        return next(same, None)
+        for display in _displays():
+            is_other = display.name != self.display.name
+            if is_other and display.position_px == self.display.position_px:
+                return display.name
+        return None
 
     @property
     def modes_hz(self) -> tuple[int, ...]:
@@ -480,11 +479,11 @@ class Window(Closing):
 
 
 def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
-    modes = glfw.get_video_modes(monitor)
-    same = {
-        int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px
-    }
-    return tuple(sorted(same - {0}))
+    rates_hz = set()
+    for mode in glfw.get_video_modes(monitor):
+        if (mode.size.width, mode.size.height) == display.resolution_px:
+            rates_hz.add(int(mode.refresh_rate))
+    return tuple(sorted(rates_hz - {0}))
 
 
 def _refresh_hint(refresh_hz: float | None, modes_hz: tuple[int, ...], display: Display) -> int:

@@ -87,7 +87,7 @@ class StatedOnce(TyperCommand):
         return super().parse_args(ctx, args)
 
     def _refuse_repeated(self, ctx: Any, args: list[str]) -> None:
-        # typer takes the last value, and says nothing of those before it
+        """Refuse (InputError) a second value, of which typer would drop the first in silence."""
         _, _, given = self.make_parser(ctx).parse_args(args=list(args))
         for parameter in self.params:
             if not isinstance(parameter, TyperOption) or parameter.is_flag or parameter.multiple:

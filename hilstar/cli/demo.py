@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from hilstar.server.summary import RunSummary
 
 HZ = 60  # the demo bench's refresh
-USUAL_S, LOOP_S = 10.0, 60.0
+USUAL_S, LOOP_S = 10.0, 60.0  # of a run, and of one with a tracker, whose noise takes answers
 MAX_MISSED = 0.01  # share of frames from which the budget is no longer the tracker's alone
-FREE_PORT = "tcp://127.0.0.1:*"
+FREE_PORT = "tcp://127.0.0.1:*"  # ZeroMQ chooses it
 # the tracker of --loop
 BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01
 PLANTED = [

@@ -25,7 +25,7 @@ from hilstar.cli.old_names import with_present_names
 from hilstar.cli.options import with_values
 from hilstar.server.console.terminal import fail
 
-INTERRUPTED = 130
+INTERRUPTED = 130  # typer's exit code of Ctrl-C
 LOG_FORMAT = "hilstar: %(message)s"
 # longest wait for a slow reader of stderr, without and with a signal
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1

@@ -40,8 +40,9 @@ if TYPE_CHECKING:
     from hilstar.server.gige.camera import GigECamera
 
 SOLVER_S = 10.0  # for a command
-NICE = 5
+NICE = 5  # behind a display on this machine, which has 0
 MAX_RATE_HZ, USUAL_RATE_HZ = 1000.0, 10.0
+# of planted errors: more than any tracker's, and arithmetic still holds them
 MAX_ARCSEC, MAX_S, MAX_PPM = 1e5, 1e5, 1e4
 SILENT = re.compile(r"(\d+(?:\.\d*)?)s?(?:@(\d+(?:\.\d*)?)s?)?")
 PLANTED = "Errors to plant"  # a panel of the help

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from hilstar.server.answers.reader import ReadPlan
     from hilstar.server.bench.bench_file import BenchFile
 
+# how long a sender, and a page on this machine, may take to say what is shown
 SHOWN_WITHIN_S, PAGE_WITHIN_S = 2.0, 0.5
-MAX_STATE_BYTES = 1_000_000
+MAX_STATE_BYTES = 1_000_000  # of a page's state; another program at its port may say more
 MAX_ROWS = 100_000  # the newest, in the JSON object
 ROW_KEYS = ("t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "valid", "mode", "rms_arcsec", "centroids")
 

@@ -227,9 +227,10 @@ def parse_spin(text: str) -> "FloatArray":
     *axis, rate_text = [part.strip() for part in text.split(",")]
     try:
         rate = math.radians(float(rate_text))
-        vector = np.array(
-            SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis]
-        )
+        if len(axis) == 1:
+            vector = np.array(SPIN_AXES[axis[0].lower()])
+        else:
+            vector = np.array([float(part) for part in axis])
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
     length = math.hypot(*vector)

@@ -136,6 +136,7 @@ def _star_named(text: str) -> str:
 
 
 def _is_number(text: str) -> bool:
+    """Whether an angle is a number of degrees."""
     try:
         float(text)
     except ValueError:

@@ -510,7 +510,9 @@ def followed(
     """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its
     follower, their requests.
     """
-    sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
+    sinks: list[FrameSink] = [status.see]
+    if record is not None:
+        sinks.insert(0, record)
     if frames is not None:
         sinks.append(frames.see)
     with (
@@ -536,6 +538,7 @@ def followed(
 
 
 def _all_of(sinks: "list[FrameSink]") -> "FrameSink":
+    """A sink that hands each frame to all of `sinks`, in their order."""
     if len(sinks) == 1:
         return sinks[0]
 

@@ -24,7 +24,7 @@ from hilstar.server.console.terminal import print_found, print_json, say
 if TYPE_CHECKING:
     from hilstar.server.console.listener import ListenAddress
 
-TOKEN_BYTES = 32
+TOKEN_BYTES = 32  # as many as `secrets` itself takes by default
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 DISPLAY_VARIABLES = ("DISPLAY", "XAUTHORITY", "WAYLAND_DISPLAY")
 

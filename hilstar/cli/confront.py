@@ -15,7 +15,7 @@ from hilstar.cli.options import (
     check_files,
 )
 from hilstar.cli.pointing import QuaternionText, RadecText, StarText, optional_attitude
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import print_found, progress, say
 
 IMAGES, USUAL_COUNT = "images", 5
 
@@ -96,9 +96,17 @@ def confront(
     if not given:
         raise InputError("confront: no image; give files, or --grab to take them")
     tell = (lambda line: None) if as_json else typer.echo
-    confronted = confront_files(
-        bench_file, given, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell
-    )
+    with progress("confronting, percent", 100) as advance:
+        confronted = confront_files(
+            bench_file,
+            given,
+            output,
+            start=start,
+            at_ns=at_ns,
+            fixed=fixed,
+            tell=tell,
+            advance=advance,
+        )
     print_found(as_json, confronted.figures, [*confronted.lines, f"page: {output / 'index.html'}"])
     for note in (*confronted.notes, *confronted.failures):
         say(note)

@@ -29,9 +29,9 @@ from hilstar.basics.reading import (
     CHUNK_BYTES,
     MAX_TOML_BYTES,
     exists,
+    named_text,
     open_regular,
     parse_toml,
-    read_text,
 )
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -147,7 +147,7 @@ def files_named_in(path: Path, text: str | None = None, depth: int = 0) -> list[
     paths = [path]
     try:
         if text is None:
-            text = read_text(path, "", MAX_TOML_BYTES)
+            text = named_text(path, "", MAX_TOML_BYTES)
         if depth < MAX_DEPTH:
             table = parse_toml(path, text)
         else:

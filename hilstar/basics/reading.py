@@ -2,6 +2,9 @@
 
 A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file:
 each is refused instead.
+
+A file that a bench file names is opened once: its hash, its checks and its readers have the same
+bytes (`named_bytes`).
 """
 
 import codecs
@@ -10,7 +13,10 @@ import logging
 import os
 import re
 import stat
+import threading
+import time
 import tomllib
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -83,6 +89,10 @@ UNMARKED = {
 # feeds, and the five bytes that are no character of it.
 NO_TEXT = re.compile("[\x00-\x08\x0b\x0e-\x1f\x7f\x81\x8d\x8f\x90\x9d]")
 
+# Two writes within a file system's step of time (2 s on FAT) leave the same times.
+SETTLED_NS = 2_000_000_000
+MAX_KEPT_BYTES = 256_000_000
+
 log = logging.getLogger(__name__)
 
 
@@ -121,7 +131,7 @@ def by_number(path: Path) -> list[str | int]:
     return [int(part) if part.isdigit() else part for part in parts]
 
 
-def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> IO[bytes]:
+def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> io.BufferedReader:
     """A regular file, open for reading. `advice` is what to give instead, such as "give the path of
     a bench file".
 
@@ -156,6 +166,77 @@ def read_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
     if len(raw) > limit_bytes:
         raise cannot_read(path, _too_large(len(raw), limit_bytes), advice)
     return raw
+
+
+class KeptFiles:
+    """What files held, each with the state in which it was read: a file that changed is read anew.
+
+    The files that were taken longest ago go where all hold more than MAX_KEPT_BYTES.
+    """
+
+    def __init__(self) -> None:
+        self._contents: OrderedDict[tuple[int, ...], bytes] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def content(self, path: Path) -> bytes | None:
+        """What the file holds, without opening it; None where it is not kept in its state."""
+        state = _settled_state(path)
+        with self._lock:
+            if state is None or state not in self._contents:
+                return None
+            self._contents.move_to_end(state)
+            return self._contents[state]
+
+    def keep(self, state: tuple[int, ...] | None, content: bytes) -> None:
+        """Keep what a file held that had this state before it was read; None is not kept."""
+        if state is None or len(content) > MAX_KEPT_BYTES:
+            return
+        with self._lock:
+            self._contents[state] = content
+            while sum(map(len, self._contents.values())) > MAX_KEPT_BYTES:
+                self._contents.popitem(last=False)
+
+
+_named = KeptFiles()
+
+
+def _settled_state(path: Path) -> tuple[int, ...] | None:
+    """What changes with a file's content: its device, inode, size and times; None for a file that
+    is missing or changed in the last SETTLED_NS.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError):  # its reader says why
+        return None
+    changed_ns = max(status.st_mtime_ns, status.st_ctime_ns)
+    if changed_ns > time.time_ns() - SETTLED_NS:
+        return None
+    return (
+        status.st_dev,
+        status.st_ino,
+        status.st_size,
+        status.st_mtime_ns,
+        status.st_ctime_ns,
+    )
+
+
+def named_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
+    """What a file holds that a bench file names, as `read_bytes`; the same again is the same
+    object. Raises InputError.
+    """
+    content = _named.content(path)
+    if content is None:
+        state = _settled_state(path)
+        content = read_bytes(path, advice, limit_bytes)
+        _named.keep(state, content)
+    if len(content) > limit_bytes:
+        raise cannot_read(path, _too_large(len(content), limit_bytes), advice)
+    return content
+
+
+def named_text(path: Path, advice: str, limit_bytes: int) -> str:
+    """The text of a file that a bench file names, as `read_text`. Raises InputError."""
+    return as_text(path, named_bytes(path, advice, limit_bytes), advice)
 
 
 def read_text(path: Path, advice: str, limit_bytes: int) -> str:
@@ -212,7 +293,12 @@ def open_lines(
     Raises InputError as `read_text` does, for what is no text, and for a line of more than
     MAX_LINE_CHARACTERS: unless `whole_lines`, such a line is given in pieces of that length.
     """
-    with open_regular(path, advice, limit_bytes) as file:
+    content = _named.content(path)
+    if content is None or len(content) > limit_bytes:
+        opened: IO[bytes] = open_regular(path, advice, limit_bytes)
+    else:
+        opened = io.BytesIO(content)
+    with opened as file:
         try:
             head = file.read(HEAD_BYTES)
             file.seek(0)

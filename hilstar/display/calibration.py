@@ -23,8 +23,8 @@ from hilstar.basics.reading import (
     MAX_TOML_BYTES,
     as_text,
     exists,
+    named_bytes,
     parse_toml,
-    read_bytes,
     read_text,
 )
 from hilstar.basics.text_tables import Chosen, TextTable, finite_numbers, needed, table_of
@@ -395,7 +395,7 @@ def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYT
     """The text of a file. Its bytes are appended to `read`, from which the calibration's hash is
     made.
     """
-    raw = read_bytes(path, ADVICE, limit_bytes)
+    raw = named_bytes(path, ADVICE, limit_bytes)
     if read is not None:
         read.append(raw)
     return as_text(path, raw, ADVICE)

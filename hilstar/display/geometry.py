@@ -14,7 +14,7 @@ from msgspec import Meta
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.files import write_whole
-from hilstar.basics.reading import parse_toml, read_text
+from hilstar.basics.reading import named_text, parse_toml
 from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.basics.toml_tables import toml_text
 from hilstar.display.identity import TABLE, MonitorIdentity
@@ -193,7 +193,7 @@ def load_notes(path: Path) -> Notes:
 
 
 def _read(path: Path, form: type[LensTable], advice: str) -> Any:
-    table = parse_toml(path, read_text(path, advice, MAX_FILE_BYTES))
+    table = parse_toml(path, named_text(path, advice, MAX_FILE_BYTES))
     try:
         return msgspec.convert(table, form)
     except msgspec.ValidationError as error:

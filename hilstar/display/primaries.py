@@ -15,7 +15,7 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.reading import read_text
+from hilstar.basics.reading import named_text
 from hilstar.basics.text_tables import finite_numbers, read_rows
 from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import (
@@ -160,7 +160,7 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
 
 
 def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
-    text = read_text(path, CCSS_ADVICE, MAX_CURVE_BYTES)
+    text = named_text(path, CCSS_ADVICE, MAX_CURVE_BYTES)
     if not text.lstrip().startswith("CCSS"):
         raise InputError(f"{path}: its first word is not CCSS; {CCSS_ADVICE}")
     try:

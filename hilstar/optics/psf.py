@@ -22,7 +22,7 @@ import numpy as np
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.image_files import ImageSizeError, opened_fits
-from hilstar.basics.reading import read_bytes
+from hilstar.basics.reading import named_bytes
 
 # The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would
 # be enough for the
@@ -646,7 +646,7 @@ def read_psf(path: Path) -> SampledPsf:
 
     The same file again is the same PSF. Raises InputError for a file that is no such image.
     """
-    return _psf_in(path, read_bytes(path, FILE_ADVICE, MAX_FILE_BYTES))
+    return _psf_in(path, named_bytes(path, FILE_ADVICE, MAX_FILE_BYTES))
 
 
 @lru_cache(maxsize=4)

@@ -17,7 +17,7 @@ import numpy as np
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError, MachineError, cannot_read
 from hilstar.basics.image_files import ImageSizeError, opened_fits, unpacked
-from hilstar.basics.reading import read_bytes
+from hilstar.basics.reading import named_bytes
 from hilstar.sky.electrons import VEGA_V0_W_M2_M
 
 MAP_ADVICE = "give a FITS image with a WCS, or a HEALPix map in FITS"
@@ -104,7 +104,7 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
     """The map in a FITS file. Raises InputError, and MachineError where a HEALPix map needs its
     library.
     """
-    raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
+    raw = named_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     try:
         with opened_fits(unpacked(raw, MAX_FILE_BYTES)) as units:
             table = next((unit for unit in units if unit.header.get("PIXTYPE") == "HEALPIX"), None)

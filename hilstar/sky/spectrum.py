@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +135,7 @@ def load_curve(
             )
         return constant_curve(float(source))
     if source in built_in:
-        return read_curve_csv(DATA_DIR / f"{source}.csv")
+        return _packaged_curve(source)
     path = folder / source
     if not exists(path):
         names = ", ".join(f'"{name}"' for name in built_in)
@@ -144,6 +145,11 @@ def load_curve(
             f"{did_you_mean(source, built_in)}write {names}, a CSV path or a number"
         )
     return read_curve_csv(path)
+
+
+@cache
+def _packaged_curve(name: str) -> Curve:
+    return read_curve_csv(DATA_DIR / f"{name}.csv")
 
 
 def read_curve_csv(path: Path, highest: float = 1.0) -> Curve:

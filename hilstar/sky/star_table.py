@@ -23,7 +23,6 @@ import os
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,7 +86,6 @@ NO_IDENTIFIER = (
 )
 VERSION = 4  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
-HASH_BYTES = 1 << 22
 MAX_STORED_BYTES = 3_000_000_000
 DTYPES = {"hip": "i4", "identifier": "i8", "variable": "S1", "multiple": "S1"} | dict.fromkeys(
     ("range_mag", "period_d", "separation_arcsec"), "f4"
@@ -595,23 +593,19 @@ class Kept:
     doubts: tuple[str, ...] = ()
 
 
+_digests: dict[tuple[int, ...], str] = {}  # of files, by their states
+
+
 def file_sha256(path: Path, advice: str) -> str:
     """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it.
     Raises InputError.
     """
     with open_regular(path, advice, table_reader.MAX_TABLE_BYTES) as file:
         status = os.fstat(file.fileno())
-    return _sha256(path, (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns), advice)
-
-
-@cache
-def _sha256(path: Path, state: tuple[int, ...], advice: str) -> str:
-    del state
-    digest = hashlib.sha256()
-    with open_regular(path, advice) as file:
-        while block := file.read(HASH_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        state = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+        if state not in _digests:
+            _digests[state] = hashlib.file_digest(file, "sha256").hexdigest()
+        return _digests[state]
 
 
 def store_path(made_of: Sequence[str]) -> Path | None:

@@ -27,7 +27,7 @@ from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import written
 from hilstar.basics.image_files import opened_fits
-from hilstar.basics.reading import read_bytes
+from hilstar.basics.reading import named_bytes
 from hilstar.basics.version import __version__
 from hilstar.optics.camera import Lens
 from hilstar.optics.psf import SampledPsf, read_psf
@@ -400,7 +400,7 @@ def read_glass(path: Path) -> SampledPsf | Glass:
 
     Raises InputError for any other file.
     """
-    return _glass_in(path, read_bytes(path, ADVICE, MAX_FILE_BYTES)) or read_psf(path)
+    return _glass_in(path, named_bytes(path, ADVICE, MAX_FILE_BYTES)) or read_psf(path)
 
 
 @lru_cache(maxsize=4)

@@ -16,7 +16,7 @@ from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError, cannot_read
 from hilstar.basics.fits_headers import read_fits_image
 from hilstar.basics.image_files import ImageSizeError, is_fits, npy_array, opened_picture
-from hilstar.basics.reading import read_bytes
+from hilstar.basics.reading import named_bytes
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.fault_kinds import Gradient, MeasuredMap
 
@@ -104,14 +104,14 @@ def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
 
 def map_sha256(path: Path) -> str:
     """The SHA-256 of a map's file. Raises InputError."""
-    return hashlib.sha256(read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)).hexdigest()
+    return hashlib.sha256(named_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)).hexdigest()
 
 
 def read_map(path: Path) -> FloatArray:
     """The image (h, w) in a file, its first row at the top. Raises InputError for one that is no
     map of light.
     """
-    raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
+    raw = named_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     values = _decoded(path, raw)
     if values.ndim != 2 or min(values.shape) < 2 or max(values.shape) > MAX_SIDE_PX:
         raise InputError(

@@ -26,7 +26,7 @@ import msgspec
 from hilstar.attitude.wire.source import HILSTARS, Mounting
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import place_of
-from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
+from hilstar.basics.reading import MAX_TOML_BYTES, named_bytes, parse_toml, read_text
 from hilstar.basics.toml_tables import toml_text
 from hilstar.display.calibration import BUILT_IN
 from hilstar.server.bench.config import (
@@ -189,7 +189,7 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
             GAUSSIAN,
         ):
             with suppress(InputError):  # its own reader explains better why a file cannot be read
-                digest.update(read_bytes(folder / name, "", MAX_NAMED_BYTES))
+                digest.update(named_bytes(folder / name, "", MAX_NAMED_BYTES))
     for large in (config.sky.catalogue, config.sky.diffuse.map):
         if large not in ("hipparcos", None):
             with suppress(InputError):

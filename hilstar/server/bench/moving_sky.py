@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.basics.reading import read_text
+from hilstar.basics.reading import named_text
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.view import POINT_PX
@@ -88,11 +88,11 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
 
         path, v0_e_per_s, rows = folder / shown.satellites, float(rates[-1]), {}
         found = read_satellites(
-            read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns
+            named_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns
         )
         if shown.satellite_magnitudes is not None:
             table = folder / shown.satellite_magnitudes
-            rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
+            rows = read_table(named_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
         brightness = brightness_of(found, rows, shown.satellite_standard_mag, v0_e_per_s)
         satellites = moving.satellites = Satellites(found, brightness, v0_e_per_s, observer, utc_ns)
         satellites.listed = sum(satellite.number in rows for satellite in found)
@@ -109,7 +109,7 @@ def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
 
     Raises InputError, and MachineError without SGP4 for elements.
     """
-    text = read_text(path, f"{TLE_ADVICE}, or a CCSDS OEM", MAX_ORBIT_BYTES)
+    text = named_text(path, f"{TLE_ADVICE}, or a CCSDS OEM", MAX_ORBIT_BYTES)
     if text.lstrip().startswith(VERSION_KEY):
         return OemOrbit(text, str(path), utc_ns, day)
     orbit = TleOrbit(text, str(path))

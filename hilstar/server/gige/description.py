@@ -148,6 +148,21 @@ def _command(name: str, about: str, address: int, value: int) -> str:
     )
 
 
+def _integer_limits(feature: Feature, settings: CameraSettings) -> str:
+    """The limits of a side or an offset, which a client's user interface takes for a slider's;
+    none for other numbers. There is no region of interest: a side has one value.
+    """
+    if feature.name in {"OffsetX", "OffsetY"}:
+        only = 0
+    elif feature.name in {"Width", "SensorWidth"}:
+        only = settings.width_px
+    elif feature.name in {"Height", "SensorHeight"}:
+        only = settings.height_px
+    else:
+        return ""
+    return f"<Min>{only}</Min><Max>{only}</Max>"
+
+
 def _feature(feature: Feature, settings: CameraSettings) -> str:
     address = ADDRESSES[feature.name]
     if feature.kind == "command":
@@ -165,7 +180,8 @@ def _feature(feature: Feature, settings: CameraSettings) -> str:
         )
     number = f'<IntReg Name="{register}">{place}<Sign>Unsigned</Sign>{BIG_ENDIAN}</IntReg>\n'
     if feature.kind == "integer":
-        return f"<Integer {opening}<pValue>{register}</pValue></Integer>\n{number}"
+        limits = _integer_limits(feature, settings)
+        return f"<Integer {opening}<pValue>{register}</pValue>{limits}</Integer>\n{number}"
     entries = dict(feature.entries)
     if feature.name == "PixelFormat":
         entries = {name: PIXEL_FORMATS[name].number for name in settings.pixel_formats()}

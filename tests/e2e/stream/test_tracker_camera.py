@@ -5,6 +5,8 @@ one of plain sockets.
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -175,6 +177,30 @@ def test_aravis_finds_it_sets_it_and_loses_no_image(display):
     assert numbers == sorted(numbers) and len(numbers) >= count - 4, (told, err)
     assert seen["brightest"] > 100
     assert told["camera"]["dropped"] == 0
+
+
+def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
+    """arv-camera-test-0.8 (Debian: aravis-tools) counts what a client of the whole standard got."""
+    program = shutil.which("arv-camera-test-0.8")
+    if program is None:
+        pytest.skip("arv-camera-test-0.8 is not installed (aravis-tools)")
+    address = own_address()
+    with tracker(display, "--camera", address) as process:
+        with GigEClient(address) as client:
+            opened(client)
+        tested = subprocess.run(
+            [program, "-n", address, "-e", "60000", "--duration=5"],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE_S,
+        )
+        ended(process)
+    counts = dict(re.findall(r"^(n_\w+) += (\d+)", tested.stdout, re.MULTILINE))
+    assert int(counts["n_completed_buffers"]) > 0, tested.stdout + tested.stderr
+    # Late packets (n_failures) are a busy machine's; these are a camera's that breaks the standard.
+    for fault in ("n_size_mismatch_errors", "n_error_packets", "n_ignored_bytes"):
+        assert int(counts[fault]) == 0, tested.stdout
 
 
 def test_without_answers_or_a_camera_it_says_what_to_write(display):

@@ -224,6 +224,17 @@ def test_every_feature_of_the_description_is_a_register_that_can_be_read():
     assert {feature.name for feature in FEATURES} <= names
 
 
+def test_a_side_has_the_detector_s_limits():
+    client = Asker(channel())
+    root = ElementTree.fromstring(_description(client))
+    space = "{http://www.genicam.org/GenApi/Version_1_1}"
+    for name in ("Width", "Height", "OffsetX"):
+        node = root.find(f"{space}Integer[@Name='{name}']")
+        value = client.read(ADDRESSES[name])
+        assert node is not None
+        assert [node.findtext(f"{space}{end}") for end in ("Min", "Max")] == [str(value)] * 2
+
+
 def _description(client: Asker) -> str:
     size = int(
         client.ask(READ_MEMORY, struct.pack(">IHH", 0x200, 0, 512))[1][4:]

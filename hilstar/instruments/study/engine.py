@@ -11,6 +11,8 @@ Methods with an error and a time are `Trials` (trials.py); a method that fails i
 (stability) or a `StressLimit` (limits.py); curves over one x are `CurvePanel`s, without rows.
 """
 
+import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -193,7 +195,8 @@ class ChartSpec:
 class CurvePanel:
     """Curves (n,) by their names against one x (n,); `spec` has the labels, scales and ticks.
 
-    `colours` are SERIES's where none are given, `look` the keywords of every line.
+    `colours` are SERIES's and `styles` solid where none are given; `look` has the keywords of every
+    line.
     """
 
     x: FloatArray
@@ -201,6 +204,7 @@ class CurvePanel:
     spec: PanelSpec
     colours: tuple[str, ...] = ()
     look: Mapping[str, Any] = field(default_factory=dict)
+    styles: tuple[str, ...] = ()
 
 
 # Tables
@@ -272,12 +276,14 @@ def row_panels(
     """Draw a chart of rows, and yield its panels for what a ChartSpec cannot say. The chart is
     written when the context ends.
     """
-    down = len(spec.panels) // spec.columns
+    down = math.ceil(len(spec.panels) / spec.columns)
     note = load.note(spec.note)
     with chart(path, finding, down, spec.columns, note=note, **spec.layout) as grid:
-        for axes, panel in zip(grid, spec.panels, strict=True):
+        for axes, panel in zip(grid, spec.panels, strict=False):
             draw_panel(axes, panel, spec, rows)
-        yield grid
+        for axes in grid[len(spec.panels) :]:
+            axes.set_axis_off()
+        yield grid[: len(spec.panels)]
 
 
 def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[Any]) -> None:
@@ -431,6 +437,7 @@ def draw_curves(path: Path, finding: str, panels: Sequence[CurvePanel], note: st
 def draw_curve_panel(axes: "Axes", panel: CurvePanel) -> None:
     """Draw the curves of one panel."""
     colours = panel.colours or SERIES
-    for (name, values_y), colour in zip(panel.curves.items(), colours, strict=False):
-        axes.plot(panel.x, values_y, color=colour, label=name, **panel.look)
+    styles = panel.styles or itertools.repeat("-")
+    for (name, values_y), colour, style in zip(panel.curves.items(), colours, styles, strict=False):
+        axes.plot(panel.x, values_y, ls=style, color=colour, label=name, **panel.look)
     finish_panel(axes, panel.spec)

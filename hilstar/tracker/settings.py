@@ -248,8 +248,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     def reset_noise_e(self) -> float:
         """kTC noise: sqrt(k T C) / q, e-."""
         thermal_v = BOLTZMANN_EV_PER_K * self.temperature_k
-        capacitance_f = self.sense_capacitance_ff * 1e-15
-        return math.sqrt(thermal_v * capacitance_f / ELECTRON_C)
+        squared_c = thermal_v * self.sense_capacitance_ff * 1e-15
+        return math.sqrt(squared_c / ELECTRON_C)
 
     def noise(self, light_e: npt.ArrayLike, exposure_s: float) -> PixelNoise:
         """The noise of pixels that light gives `light_e` electrons on average, background among

@@ -19,7 +19,14 @@ from numpy.polynomial.polynomial import polyvander
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.optics.glass.psf_file import MAX_NEGATIVE, TOLERANCE, Glass, moment_carriers, principal
+from hilstar.optics.glass.psf_file import (
+    MAX_NEGATIVE,
+    TOLERANCE,
+    Glass,
+    moment_carriers,
+    offsets,
+    principal,
+)
 from hilstar.optics.psf import (
     BLACK_SAMPLES,
     MAX_FOOTPRINT_PX,
@@ -298,8 +305,8 @@ class GlassPsf(SampledPsf):
         light.
         """
         _, height, width = self.optics.basis.shape
-        down = np.abs(_offsets(height))
-        across = np.abs(_offsets(width))
+        down = np.abs(offsets(height))
+        across = np.abs(offsets(width))
         ring = np.maximum(down[:, None], across).ravel()
         rings = []
         for image in self.optics.basis:
@@ -345,7 +352,7 @@ class GlassPsf(SampledPsf):
         """
         side = self.footprint_px
         star_px = np.arange(steps + 1)[:, None] / steps - 0.5
-        at_px = (_offsets(side) - star_px).ravel()
+        at_px = (offsets(side) - star_px).ravel()
         tables = []
         for size in self.optics.basis.shape[1:]:
             pixels = _pixels_of(size, self.per_px, at_px, self.pixel_integrated)
@@ -464,8 +471,8 @@ class GlassPsf(SampledPsf):
         """The centroid of each PSF from its chief ray (F, L, 2), px."""
         _, height, width = self.optics.basis.shape
         basis = self.optics.basis
-        moment_x = basis.sum(axis=1) @ _offsets(width)
-        moment_y = basis.sum(axis=2) @ _offsets(height)
+        moment_x = basis.sum(axis=1) @ offsets(width)
+        moment_y = basis.sum(axis=2) @ offsets(height)
         moments = np.stack([moment_x, moment_y], axis=1)
         return np.asarray(self.optics.weights @ moments / self.per_px)
 
@@ -534,7 +541,7 @@ class GlassPsf(SampledPsf):
         `_drawn` approximates, exact and some hundred times as slow.
         """
         side = self.footprint_px
-        at_px = _offsets(side)
+        at_px = offsets(side)
         stamps = np.empty((len(x_px), side, side))
         mixed = self._mixed(x_px, y_px, shares)
         for stamp, weights, x, y in zip(stamps, mixed, x_px, y_px, strict=True):
@@ -662,7 +669,7 @@ def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[Floa
     old_half = np.array([width, height]) // 2
     new_half = np.ceil(np.abs(np.linalg.inv(to_samples)) @ old_half)
     half_x, half_y = new_half.astype(int).tolist()
-    x, y = np.meshgrid(_offsets(2 * half_x + 1), _offsets(2 * half_y + 1))
+    x, y = np.meshgrid(offsets(2 * half_x + 1), offsets(2 * half_y + 1))
     columns, rows = np.tensordot(to_samples, np.stack([x, y]), axes=1)
     at = np.stack([rows + height // 2, columns + width // 2])
     drawn = []
@@ -811,16 +818,11 @@ def _in_pixel(place_px: FloatArray) -> FloatArray:
     return np.asarray(place_px - np.floor(place_px + 0.5))
 
 
-def _offsets(count: int) -> IntArray:
-    """How far each of so many samples of a row is from the middle one, samples."""
-    return np.arange(count) - count // 2
-
-
 def _grid_offsets(rows: int, columns: int) -> IntArray:
     """How far each sample of an image is right of the middle one and below it, (n, 2), row by
     row.
     """
-    x, y = np.meshgrid(_offsets(columns), _offsets(rows))
+    x, y = np.meshgrid(offsets(columns), offsets(rows))
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
@@ -836,7 +838,7 @@ def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> F
     from scipy.interpolate import make_interp_spline
 
     unit_images = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
-    place_px = _offsets(len(unit_images)) / per_px
+    place_px = offsets(len(unit_images)) / per_px
     spline = make_interp_spline(place_px, unit_images, SPLINE_DEGREE)
     last_px = place_px[-1]
     if integrated:

@@ -30,7 +30,7 @@ from hilstar.optics.camera import Lens
 from hilstar.optics.glass.codev_file import read_codev
 from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription, LensSurface
 from hilstar.optics.glass.optiland_lens import optic_of
-from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places
 from hilstar.optics.glass.zemax_file import read_zemax
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
@@ -312,7 +312,7 @@ class _LensRays:
         """Rays of a pupil's grid (n, n) from a field (2,), relative to the largest, at a
         wavelength.
         """
-        at = _cell_middles(rays)
+        at = pupil_places(rays)
         across, down = np.meshgrid(at, at)
         filled = _filled(rays)
         radius = float(np.hypot(*field))
@@ -392,16 +392,11 @@ def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
 @lru_cache(maxsize=4)
 def _filled(rays: int) -> FloatArray:
     """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
-    fine = _cell_middles(rays * FINER)
+    fine = pupil_places(rays * FINER)
     radius2 = fine**2 + fine[:, None] ** 2
     inside = radius2 <= 1
     cells = inside.reshape(rays, FINER, rays, FINER)
     return np.asarray(cells.mean(axis=(1, 3)))
-
-
-def _cell_middles(count: int) -> FloatArray:
-    """The middles (count,) of equal parts of -1 to 1."""
-    return np.asarray((np.arange(count) + 0.5) / count * 2 - 1)
 
 
 def _size_of(value: Any) -> float:

@@ -252,7 +252,8 @@ class Camera:
         limit = np.inf
         if self.lens is not None:
             limit = self.lens.max_tangent * WITHIN
-        beyond = np.flatnonzero(u * u + v * v > limit**2)
+        radius2 = u * u + v * v
+        beyond = np.flatnonzero(radius2 > limit**2)
         if not len(beyond):
             return self.places_px(u, v)
         times = np.hypot(u[beyond], v[beyond]) / limit
@@ -385,9 +386,12 @@ class Camera:
         along_x = a * u + b * v
         along_y = c * u + d * v
         wide = 1 + u * u + v * v
-        xx = wide * (a * a + b * b + along_x**2)
-        yy = wide * (c * c + d * d + along_y**2)
-        xy = wide * (a * c + b * d + along_x * along_y)
+        plain_xx = a * a + b * b
+        plain_yy = c * c + d * d
+        plain_xy = a * c + b * d
+        xx = wide * (plain_xx + along_x**2)
+        yy = wide * (plain_yy + along_y**2)
+        xy = wide * (plain_xy + along_x * along_y)
         middle = (xx + yy) / 2
         spread = np.hypot((xx - yy) / 2, xy)
         smallest = float(np.sqrt(np.nanmin(middle - spread)))
@@ -421,8 +425,10 @@ class Camera:
         """Whether places in pixels are on the image; not so at NaN."""
         width, height = self.resolution_px
         with np.errstate(invalid="ignore"):
-            across = np.abs(x_px - (width - 1) / 2) <= width / 2
-            down = np.abs(y_px - (height - 1) / 2) <= height / 2
+            off_x = np.abs(x_px - (width - 1) / 2)
+            off_y = np.abs(y_px - (height - 1) / 2)
+            across = off_x <= width / 2
+            down = off_y <= height / 2
         return np.asarray(across & down)
 
     def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:

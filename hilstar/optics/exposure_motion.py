@@ -68,11 +68,12 @@ class Motion:
         A constant rate turns about one axis: Rodrigues' formula on the attitude in the middle.
         """
         speed = float(np.linalg.norm(self.rate_cam_rad_s))
-        x, y, z = self.rate_cam_rad_s / speed if speed else np.zeros(3)
+        x, y, z = self.rate_cam_rad_s / (speed or 1.0)
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         angle = -speed * seconds[:, None, None]
         # `cross` squared is what Rodrigues' formula has of the axis
-        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+        squared = cross @ cross
+        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * squared
         return np.asarray(camera.cam_to_image @ turn @ to_matrix(self.q_icrs_to_cam))
 
 

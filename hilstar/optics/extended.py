@@ -140,11 +140,15 @@ class DiscLight:
         middle_y, half_y = _middle_and_half(y_px)
         variance_x, variance_y = self.psf.variance_px2
         sheared_px = self._sheared_px()
-        half_x = half_x + REACH_SIGMAS * float(np.sqrt(variance_x)) + 1 + sheared_px
-        half_y = half_y + REACH_SIGMAS * float(np.sqrt(variance_y)) + 1 + sheared_px
-        low = middle_x - half_x, middle_y - half_y
-        high = middle_x + half_x, middle_y + half_y
-        return clipped((*low, *high), resolution_px)
+        spread_x = REACH_SIGMAS * float(np.sqrt(variance_x))
+        spread_y = REACH_SIGMAS * float(np.sqrt(variance_y))
+        half_x = half_x + spread_x + 1 + sheared_px
+        half_y = half_y + spread_y + 1 + sheared_px
+        left = middle_x - half_x
+        right = middle_x + half_x
+        top = middle_y - half_y
+        bottom = middle_y + half_y
+        return clipped((left, top, right, bottom), resolution_px)
 
     def _sheared_px(self) -> float:
         """How far the first and the last pixels' light is moved by the shear at most, about."""
@@ -152,7 +156,8 @@ class DiscLight:
             return 0.0
         width, height = self.camera.resolution_px
         by_column_s, by_row_s = self.shear.s_per_px
-        late_s = (abs(by_column_s) * width + abs(by_row_s) * height) / 2
+        whole_s = abs(by_column_s) * width + abs(by_row_s) * height
+        late_s = whole_s / 2
         turn_rad = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
         lever_px = float(np.hypot(self.camera.focal_length_px, max(width, height)))
         return 2 * turn_rad * lever_px
@@ -164,7 +169,9 @@ def _middle_and_half(limb_px: FloatArray) -> tuple[float, float]:
     """
     low = float(limb_px.min())
     high = float(limb_px.max())
-    return (low + high) / 2, (high - low) / 2 * BOW
+    middle = (low + high) / 2
+    half = (high - low) / 2 * BOW
+    return middle, half
 
 
 ExtendedLight = LightMap | GlowLight | DiscLight
@@ -204,8 +211,10 @@ def clipped(
     """The pixels of an image within left, top, right and bottom (the last two excluded); None
     where there is none.
     """
-    left, top = np.floor(edges_px[:2]).clip(0, resolution_px).astype(int).tolist()
-    right, bottom = np.ceil(edges_px[2:]).clip(0, resolution_px).astype(int).tolist()
+    first = np.floor(edges_px[:2]).clip(0, resolution_px)
+    end = np.ceil(edges_px[2:]).clip(0, resolution_px)
+    left, top = first.astype(int).tolist()
+    right, bottom = end.astype(int).tolist()
     if right > left and bottom > top:
         return (left, top, right - left, bottom - top)
     return None
@@ -263,10 +272,15 @@ def _at_pose(light: DiscLight) -> list[ExtendedLight]:
     """A disc at one pose: itself, a map where it is small, nothing where it is not on the image."""
     camera = light.camera
     radius_px = float(np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px)
-    if radius_px < SMALL_SIGMAS * max(light.psf.variance_px2) ** 0.5:
-        nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.psf.variance_px2) ** 0.5))
-        drawn = _disc_map(light, min(max(MIN_NODES, nodes), MAX_NODES))
-        return [] if drawn is None else [drawn]
+    widest_px = max(light.psf.variance_px2) ** 0.5
+    narrowest_px = min(light.psf.variance_px2) ** 0.5
+    if radius_px < SMALL_SIGMAS * widest_px:
+        wanted = int(np.ceil(NODES_A_SIGMA * radius_px / narrowest_px))
+        nodes = min(max(MIN_NODES, wanted), MAX_NODES)
+        drawn = _disc_map(light, nodes)
+        if drawn is None:
+            return []
+        return [drawn]
     if light.region(camera.resolution_px) is None:
         return []
     return [light]
@@ -296,9 +310,11 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         whole = _places(light, replace(disc, law="uniform"), nodes)
     if not len(whole.x_px):
         return None
-    left, right = float(whole.x_px.min()), float(whole.x_px.max())
-    top, bottom = float(whole.y_px.min()), float(whole.y_px.max())
-    edges = (left - reach_px, top - reach_px, right + reach_px + 1, bottom + reach_px + 1)
+    left = float(whole.x_px.min()) - reach_px
+    top = float(whole.y_px.min()) - reach_px
+    right = float(whole.x_px.max()) + reach_px + 1
+    bottom = float(whole.y_px.max()) + reach_px + 1
+    edges = (left, top, right, bottom)
     region = clipped(edges, camera.resolution_px)
     if region is None:
         return None
@@ -306,8 +322,8 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     if light.covers:
         # Pixels to a steradian at the disc's middle: nearly the same over a small disc
         u, v, w = light.icrs_to_image @ disc.direction
-        a, b, c, d = camera.slopes(np.array([u / w]), np.array([v / w]))
-        px2_per_tangent2 = np.nan_to_num(a * d - b * c)[0]
+        slopes = camera.slopes(np.array([u / w]), np.array([v / w]))
+        px2_per_tangent2 = np.nan_to_num(slopes.areas)[0]
         px_per_sr = float(px2_per_tangent2 / abs(w) ** 3)
         share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * px_per_sr, region)
         cover = np.where(share > WHOLE, np.float32(1), share)

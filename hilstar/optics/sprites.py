@@ -300,7 +300,8 @@ def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
     columns).
     """
     rates = stars.rates_e_per_s
-    return np.asarray(rates @ shares[: len(rates)] / (rates.sum() or 1.0))
+    total = rates.sum() or 1.0
+    return np.asarray(rates @ shares[: len(rates)] / total)
 
 
 def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
@@ -317,7 +318,8 @@ def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
 
 def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
     """Shares (n, columns) of light of colours (n,), by those of BV_MAG."""
-    return np.stack([np.interp(bv_mag, BV_MAG, column) for column in by_bv.T], axis=-1)
+    shares = [np.interp(bv_mag, BV_MAG, column) for column in by_bv.T]
+    return np.stack(shares, axis=-1)
 
 
 def shares_of_sprites(
@@ -431,7 +433,9 @@ def clipped_sprites(
     x = np.rint(sprites.x_px[bright]).astype(int)
     y = np.rint(sprites.y_px[bright]).astype(int)
     width, height = resolution_px
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    across = (x >= 0) & (x < width)
+    down = (y >= 0) & (y < height)
+    inside = across & down
     bright = bright[inside]
     x = x[inside]
     y = y[inside]
@@ -446,7 +450,8 @@ def clipped_sprites(
         brightest_first = np.argpartition(-own_light[doubtful], MAX_DOUBTFUL)
         doubtful = doubtful[brightest_first[:MAX_DOUBTFUL]]
     if len(doubtful):
-        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], psf) > limit[doubtful]
+        light = _light_at(sprites, x[doubtful], y[doubtful], psf)
+        over[doubtful] = light > limit[doubtful]
     return np.asarray(bright[over], dtype=np.intp)
 
 
@@ -462,7 +467,8 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
         offset_x = x[:, None] - sprites.x_px[close]
         offset_y = y[:, None] - sprites.y_px[close]
         share = psf.shares(offset_x, offset_y)
-        share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
+        farther = np.maximum(np.abs(offset_x), np.abs(offset_y))
+        share[farther > reach] = 0.0
         rates = sprites.data["electrons_per_s"][close].astype(np.float64)
         return np.asarray(share @ rates)
     order = close[np.argsort(sprites.x_px[close])]
@@ -472,7 +478,8 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
     pixel = np.repeat(np.arange(len(x)), count)
     # the pairs of a pixel are `count` sprites of `order` from its first on
     first_pair = np.cumsum(count) - count
-    other = order[np.arange(len(pixel)) + np.repeat(first - first_pair, count)]
+    to_sprite = np.repeat(first - first_pair, count)
+    other = order[np.arange(len(pixel)) + to_sprite]
     offset_y = y[pixel] - sprites.y_px[other]
     near = np.abs(offset_y) <= reach
     pixel = pixel[near]
@@ -485,7 +492,8 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
 
 def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:
     """Which pixels (n,) of an axis are within a footprint of one of the `wanted` (k,)."""
-    near = np.zeros(int(wanted.max(initial=0)) + 2 * size_px + 2, dtype=np.bool_)
+    last = int(wanted.max(initial=0)) + 2 * size_px + 1
+    near = np.zeros(last + 1, dtype=np.bool_)
     for place in set(wanted.tolist()):
         near[place : place + 2 * size_px + 1] = True
     return near.take(pixel + size_px, mode="clip")

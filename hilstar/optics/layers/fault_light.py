@@ -405,9 +405,8 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     if identifier is None:
         return np.empty(0, dtype=np.intp)
     nameless = np.flatnonzero(stars.hip[:first] == 0)
-    return np.asarray(
-        nameless[stars.catalog.identifier[stars.row[nameless]] == identifier], dtype=np.intp
-    )
+    identifiers = stars.catalog.identifier[stars.row[nameless]]
+    return np.asarray(nameless[identifiers == identifier], dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True)
@@ -440,9 +439,12 @@ class Lines:
         begin_x, begin_y = camera.pixels_from(source, *self.begin_px.T)
         end_x, end_y = camera.pixels_from(source, *self.end_px.T)
         sigma_x, sigma_y = psf.width_px
-        length_sigma = np.hypot((end_x - begin_x) / sigma_x, (end_y - begin_y) / sigma_y)
+        across_sigma = (end_x - begin_x) / sigma_x
+        down_sigma = (end_y - begin_y) / sigma_y
+        length_sigma = np.hypot(across_sigma, down_sigma)
         known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
-        steps = np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp)
+        wanted = np.ceil(known / STEP_SIGMA)
+        steps = np.minimum(wanted, MAX_STEPS - 1).astype(np.intp)
         counts = np.where(known < 0, 0, steps + 1)
         line = np.repeat(np.arange(len(counts)), counts)
         first = np.repeat(np.cumsum(counts) - counts, counts)
@@ -450,7 +452,9 @@ class Lines:
         # of its equal parts.
         order = np.arange(len(line)) - first
         share = ((order + 0.5) / counts[line])[:, None]
-        places = self.begin_px[line] * (1 - share) + self.end_px[line] * share
+        begin = self.begin_px[line]
+        end = self.end_px[line]
+        places = begin * (1 - share) + end * share
         x_px, y_px = camera.pixels_from(source, *places.T)
         light = self.electrons_per_s[line] / counts[line]
         return PointChain(x_px, y_px, light, line, len(counts))

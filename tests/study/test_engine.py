@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import doctest
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from hilstar.basics import charts
+from hilstar.instruments.study import engine
 from hilstar.instruments.study.engine import (
     HIDDEN,
     BarSpec,
@@ -28,7 +30,7 @@ from hilstar.instruments.study.engine import (
     write_rows,
 )
 from hilstar.instruments.study.sweep import Load
-from tests.support.pictures import table
+from tests.support.pictures import assert_drawn, table
 
 BUSY = Load(1e3)
 
@@ -234,3 +236,14 @@ def test_curves_have_the_styles_that_are_given(figure, tmp_path):
     panel = CurvePanel(x, {"solid": x, "dotted": -x}, PanelSpec(), styles=("-", ":"))
     draw_curves(tmp_path / "x", "A finding", (panel,))
     assert [line.get_linestyle() for line in figure[0].axes[0].get_lines()] == ["-", ":"]
+
+
+def test_the_example_of_the_engine_draws_a_legible_chart_and_its_table(tmp_path):
+    """tests/study/conftest.py looks at the chart as it is saved."""
+    names = {**vars(engine), "folder": tmp_path}
+    example = doctest.DocTestParser().get_doctest(engine.__doc__, names, "engine", None, None)
+    printed: list[str] = []
+    result = doctest.DocTestRunner().run(example, out=printed.append)
+    assert result.attempted == 9 and result.failed == 0, "".join(printed)
+    assert_drawn(tmp_path / "cost.png")
+    assert [row["way"] for row in table(tmp_path / "cost.csv")] == ["round"] * 2 + ["exact"] * 2

@@ -23,7 +23,7 @@ from hilstar.basics.charts import capital
 
 MIN_ROUNDS = 3  # every work runs this often, whatever its share of a budget
 MAX_ROUNDS = 500  # more do not move a median
-SEED = 1
+SEED = 1  # of the orders of rounds
 # share of the cores taken by others above which times are 5 % and more off: a third of one of two
 # cores
 BUSY_SHARE = 0.15

@@ -73,7 +73,7 @@ BODIES: dict[str, tuple[Table, Table]] = {
     "all": ({"planets": True, "moon": True, "sun": True, "earth": True}, LOW_ORBIT),
 }
 FRAME_NS = round(NS_PER_S / REFRESH_HZ)
-SIGMA_PX = (0.85, 0.85)
+SIGMA_PX = (0.85, 0.85)  # of sprites by default
 MIDDLE_PX = (0.2, -0.3)  # disc centre from the middle pixel's centre: off any symmetry
 FOCAL_PX = 6000.0  # a pixel is 34 arcsec, as on the demo's monitor
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
@@ -95,7 +95,7 @@ QUICK_DEG: dict[str, tuple[float, ...]] = {
     "Sun": (40.0, 0.5),
     "Earth": (40.0, 0.0, -70.0),
 }
-ROUNDS, QUICK_ROUNDS = 40, 3
+ROUNDS, QUICK_ROUNDS = 40, 3  # of which the fastest frame counts
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
 FLUX_LIMIT, LIMB_LIMIT_PX = 0.01, 0.1
 DISC_PX = 0.2  # a body of a smaller diameter is drawn as a point

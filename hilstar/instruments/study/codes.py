@@ -57,7 +57,7 @@ BITS = (8, 10, 12)
 # By bits: the largest flux error allowed, mag, and the magnitudes under white over which it is
 # allowed.
 AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
-AIM_PX = 0.01
+AIM_PX = 0.01  # the largest place error allowed, by a PSF fit
 # Rec. 709's shares of white stand in for the primaries as a tracker sees them.
 STEALING_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)
 FRAME_PX = (1920, 1080)
@@ -65,9 +65,9 @@ STARS = 1000
 SEED = 1
 STEALING = ", bit stealing"
 JUDGE: Centroider = "fit"  # as most trackers do
-FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)
+FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)  # of an exposure
 BEGINS = (2.0, 3.4, 5.7, 7.1)  # refreshes: exposures begin within frames too
-AIM_FRAMES = 6
+AIM_FRAMES = 6  # of an exposure of 0.1 s at 60 Hz
 JUDGED: tuple[Centroider, ...] = ("moment", "window", "fit")  # over frames
 MANY_STEPS = 100  # from which on they are written without a decimal
 SMALL = {"ms": 4}

@@ -5,7 +5,21 @@ function that measures rows, and specs of charts (x, y, series, scales, note). `
 the table, `draw_rows` a chart. A value of a row is the name of a field, or a function of the row
 where the chart draws something else (a floor, another unit). Rows of two types may share a chart:
 what was measured, and the law that foretells it. A panel has lines and points (`LineSpec`), upright
-bars (`BarSpec`), or some values of each row on a line of its own (`DotsSpec`).
+bars (`BarSpec`), or some values of each row on a line of its own (`DotsSpec`). A study in short:
+
+    >>> @dataclass(frozen=True)
+    ... class Cost:
+    ...     way: str
+    ...     stars: int
+    ...     frame_ms: float
+    >>> rows = [Cost("round", 100, 0.4), Cost("round", 1000, 2.1)]
+    >>> rows += [Cost("exact", 100, 0.9), Cost("exact", 1000, 5.2)]
+    >>> line = LineSpec("stars", "frame_ms")
+    >>> panel = PanelSpec((line,), "time of a frame [ms]", "stars", scales=("log", "log"))
+    >>> looks = looks_of({"round": "rounded codes", "exact": "exact codes"}, "os")
+    >>> spec = ChartSpec((panel,), lambda row: row.way, looks, "Medians.")
+    >>> write_rows(folder / "cost.csv", rows)
+    >>> draw_rows(folder / "cost", "Exact codes take 5.2 ms with 1000 stars", spec, rows)
 
 Methods with an error and a time are `Trials` (trials.py); a method that fails is a `FailureCase`
 (stability) or a `StressLimit` (limits.py); curves over one x are `CurvePanel`s, without rows.

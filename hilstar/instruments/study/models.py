@@ -137,9 +137,9 @@ DARK_LAWS: dict[str, dict[str, Any]] = {
 COLD_K = 273.0
 BODIES_K = (3000.0, 5000.0, 9000.0, 30_000.0)
 BAND_COLOURS = (PURPLE, BLUE, GREEN, ORANGE, INK)
-CORNERS_HZ = (0.0, 1e4, 1e5)
+CORNERS_HZ = (0.0, 1e4, 1e5)  # of 1/f noise
 ZODIACAL_V_MAG, ZODIACAL_NM = 22.1, (330.0, 1100.0)
-BRIGHT_V_MAG = 7.5
+BRIGHT_V_MAG = 7.5  # to which Hipparcos is complete
 HELD_OUT = "pickles, leave-one-out"
 BY_TYPE = "mk, leave-one-out"
 BODY = "black body, ballesteros2012"
@@ -156,7 +156,7 @@ SCALE_STYLES, SCALE_COLOURS = (":", "-", "-"), (MUTED, BLUE, ORANGE)
 ZERO_LINE = LevelLine(0, HIDDEN, style="-", width=1)
 BAR = {"width": 0.38}
 WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
-MIN_STARS = 20
+MIN_STARS = 20  # 5 % of fewer is no star
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SEED = 1
-ZOOM_PX = 160
-STRETCH_PERCENT = (1, 99.8)
+ZOOM_PX = 160  # side of the part that is shown
+STRETCH_PERCENT = (1, 99.8)  # of the pixels below black, and below white
 # From black to white, in sigmas of the sky's noise: at least, and at most where a body fills
 # pixels.
 MIN_SIGMAS, MAX_SIGMAS = 10.0, 300.0

@@ -60,8 +60,8 @@ RATES_HZ = (5, 10, 20, 50, 100, 200)
 LATENCIES_MS = (2, 5, 10, 20, 50, 100)
 USUAL_HZ, USUAL_MS = 100, 20
 FRAME_HZ = 60
-SPAN_S, QUICK_SPAN_S = 40.0, 4.0
-TIMED = 200
+SPAN_S, QUICK_SPAN_S = 40.0, 4.0  # of the slew: two of its swings, or part of one
+TIMED = 200  # attitudes, whose median time counts
 MARKERS = "osd^vx"
 
 Way = Literal["rate", "auto", "newest"]

@@ -46,9 +46,8 @@ class Predictor:
 def predictors() -> tuple[Predictor, ...]:
     """Every way. The default is hilstar's timeline with a bench file's defaults, fed with rates."""
     settings = AttitudeSettings()
-    bench_policy = Policy(
-        round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS)
-    )
+    ahead_ns = round(settings.max_extrapolation_ms * NS_PER_MS)
+    bench_policy = Policy(ahead_ns, round(settings.stale_after_ms * NS_PER_MS))
     hold = Policy(0, bench_policy.stale_after_ns)
     return (
         Predictor("hold", partial(_timeline, hold)),
@@ -71,11 +70,11 @@ def slew_attitude(t_ns: int) -> FloatArray:
     and a fast jitter.
     """
     t_s = t_ns / NS_PER_S
-    return shaken(
-        ORION,
-        t_s,
-        [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)],
-    )
+    angles_rad = []
+    for axis in range(3):
+        swing = math.sin(2 * math.pi * t_s / SLEW_S + axis)
+        angles_rad.append(math.radians(SLEW_DEG) * swing)
+    return shaken(ORION, t_s, angles_rad)
 
 
 def shaken(
@@ -85,11 +84,11 @@ def shaken(
     q = q_icrs_to_cam
     for axis, angle in enumerate(angles_rad):
         for size_arcsec, hz in JITTER:
-            angle += math.radians(size_arcsec / 3600) * math.sin(
-                2 * math.pi * hz * t_s + 2 * axis * hz
-            )
+            phase = 2 * math.pi * hz * t_s + 2 * axis * hz
+            angle += math.radians(size_arcsec / 3600) * math.sin(phase)
         turn = np.zeros(4)
-        turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+        turn[0] = math.cos(angle / 2)
+        turn[1 + axis] = math.sin(angle / 2)
         q = multiply(turn, q)
     return q
 
@@ -172,15 +171,15 @@ def _timeline(
 
 def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
     """Extrapolation by the newest rate and its change since the sample before."""
-    (before_ns, before), (newest_ns, newest) = (
-        (s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:]
-    )
+    before, newest = near[-2:]
+    rate_before = np.asarray(before.rate_cam_rad_s)
+    rate = np.asarray(newest.rate_cam_rad_s)
 
     def predicted(t_ns: int) -> FloatArray:
-        ahead_s = (t_ns - newest_ns) / NS_PER_S
-        gap_s = (newest_ns - before_ns) / NS_PER_S
-        bend = (newest - before) / gap_s
-        return propagate(near[-1].q_icrs_to_cam, newest + 0.5 * ahead_s * bend, ahead_s)
+        ahead_s = (t_ns - newest.t_ns) / NS_PER_S
+        gap_s = (newest.t_ns - before.t_ns) / NS_PER_S
+        bend = (rate - rate_before) / gap_s
+        return propagate(newest.q_icrs_to_cam, rate + 0.5 * ahead_s * bend, ahead_s)
 
     return predicted
 

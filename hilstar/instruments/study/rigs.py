@@ -71,7 +71,7 @@ READ_NOISE_E = FULL_WELL_E / 30 / math.sqrt(12)
 # star_detection_centroiding.py: a dark frame's mean; main_detection_centroiding.py: 3 DN over the
 # background, areas over 3 px, and 7 x 7 px for the centre of mass.
 DARK_DN, THRESHOLD_DN, MIN_PIXELS, MASS_HALF_PX = 10.0, 3.0, 4, 3
-GRID_HALF_PX, FIT_HALF_PX = 2, 4
+GRID_HALF_PX, FIT_HALF_PX = 2, 4  # half sides of the squares of pixels that they use
 EDGE_PX, MATCHED_PX = 5, 3.0
 # Sigma over five minutes about the boresight and two axes across it, arcsec, STATIC.
 SCATTER_ARCSEC = {
@@ -81,12 +81,12 @@ SCATTER_ARCSEC = {
 }
 FITTED, LIGHT_UNIT = "Gaussian grid", "DN"
 LIGHTS_DN = (34.0, 40.0, 48.0, 60.0, 80.0)
-EXPOSURES, QUICK_EXPOSURES = 300, 40
+EXPOSURES, QUICK_EXPOSURES = 300, 40  # chance moves a sigma of so many by 4 and 11 %
 # Naples: a panel of 0.641 m of 2560 pixels before 1.3 m (REPOSITORY, old_error_analysis.py); 16
 # stars a solution, 22.48 x 17.02 degrees, 5 and 30 arcsec (NAPLES_SOURCE).
 NAPLES_PIXEL_ARCSEC = 641.0 / 2560 / 1300.0 * ARCSEC_PER_RAD
 NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_ARCSEC = 16, (22.48, 17.02), (30.0, 5.0)
-TRIALS = 2000
+TRIALS = 2000  # chance moves an rms of so many by 1.6 %
 P13_RESOLUTION_ARCSEC, P13_ARCSEC = 3.43, 2.0
 OUTSIDE_PIXEL_ARCSEC, OUTSIDE_CODES_ARCSEC, OUTSIDE_CODES_MAG = 10.30, 0.082, 0.0054
 PLACE_UNIT = "arcsec rms an axis"

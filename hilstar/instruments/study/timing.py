@@ -59,7 +59,7 @@ STRIPES_RADEC_ROLL_DEG = (84.0, 0.0, 0.0)
 STRIPE_ROWS, ROW_TIME_US, REFRESH_HZ = 1024, 60.0, 60.0
 STRIPE_SIZE_PX = (128, STRIPE_ROWS)
 EVERY_ROWS = 16  # between dots
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # a smaller departure is the arithmetic's
 STRIPE_NOTE = (
     f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each,"
     " the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
@@ -108,12 +108,12 @@ STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
 ISOLATION = study_benches.Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 QUICK_RATES_DEG_S = (2.0,)
-DRAW_TO_SWAP_S = 0.010
+DRAW_TO_SWAP_S = 0.010  # from the newest packet that a frame has to its swap
 EXPOSURE_S = 0.1
 START_S = 0.0037  # exposure start within a refresh period
 REFRESH_MS = 1e3 / 60  # the default of a bench file
 FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
-COST_ROUNDS = 9
+COST_ROUNDS = 9  # of which the median counts
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ QUANTISATIONS: tuple[Quantisation, ...] = ("round", "dither", "temporal", "exact
 SPRITES: tuple[Sprite, ...] = ("full", "cut", "coarse")
 COARSER = 10.0  # times the bench file's tolerance, for the sprites `coarse`
 SHALLOWER_MAG = 1.0  # by which the shallower catalogue that is tried ends earlier
-FIELDS = 200
+FIELDS = 200  # random fields, among which the scenes are chosen
 DENSE = 1  # the place of the densest field among the scenes
 SEED = 1
 ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
@@ -51,7 +51,7 @@ ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
 # electrons per second.
 Lit = tuple[IntArray, FloatArray]
 START_S = 0.0037  # exposure start after a frame's first light, within a refresh
-MAX_FRAMES = 16
+MAX_FRAMES = 16  # refreshes: of a longer exposure only so many are measured
 DEG_PER_RAD = math.degrees(1.0)
 OWN = {"effort": "auto", "quantisation": "auto"}
 

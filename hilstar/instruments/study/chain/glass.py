@@ -45,8 +45,8 @@ from hilstar.tracker.centroiders import star_places
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-TIME_S, QUICK_TIME_S = 30.0, 2.0
-MIN_STARS = 3
+TIME_S, QUICK_TIME_S = 30.0, 2.0  # for the frames of all PSFs
+MIN_STARS = 3  # an rms of fewer is chance
 SEED = 1
 # Without a line: each point is named.
 GLASS_LOOK = FrontLook(

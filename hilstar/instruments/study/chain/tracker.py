@@ -38,10 +38,10 @@ from hilstar.sky.stars import Stars
 # of a star in every pixel (optics/exposure_motion.py); JITTER's 37 Hz over the longest exposure are
 # well within the minimum.
 NODES_PER_SIGMA, MIN_NODES = 1.02, 24
-REACH_SIGMAS = 4.0
+REACH_SIGMAS = 4.0  # beyond which a star has 3e-4 of its light
 LOST_SHARE = 0.1  # a star with a smaller share of its light in its pixels is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
-PATH_STEP_PX = 0.5
+PATH_STEP_PX = 0.5  # between the places of a path
 # limit for others' light on a star's path, as a share of its own: at 50 px it moves the centre by
 # 0.05 px
 OTHERS_SHARE = 1e-3

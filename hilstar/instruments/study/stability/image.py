@@ -35,7 +35,7 @@ from hilstar.sky.stars import make_stars, unit_vectors_icrs
 IMAGE_PX = (512, 512)
 MIDDLE_PX = 256
 OFF_MIDDLE_PX = (256.3, 256.0)
-SIGMA_PX = 0.85
+SIGMA_PX = 0.85  # of sprites by default
 SEED = 1
 # The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of
 # two.
@@ -74,7 +74,7 @@ CODES_SEED = 6
 # groups of stars along either side of the image, and the side of each one's part of it
 COUNT, TILE_PX = 8, 22
 SIDE_PX = COUNT * TILE_PX
-WHITE = 1.0
+WHITE = 1.0  # light of white, of which errors are shares
 FAINT_MAG = 6.0  # under the star whose peak is white
 NARROW_PX = 0.3
 # A star of equal steps can have its light within half of one and no nearer; where steps differ it

@@ -66,7 +66,7 @@ from hilstar.tracker.centroiders import FAMILY
 
 SENSOR = "ccd47-20"
 ADAPTIVE = "adaptive quadrature"
-COLOURS = 3000
+COLOURS = 3000  # stars of the catalogue that stand for all
 STEPS_NM = (1.0, 5.0, 10.0, 20.0)
 ORDERS = (1, 2, 3, 4, GAUSS_ORDER)
 DEGREES = (5, 10, 20, electrons.TABLE_DEGREE)
@@ -91,7 +91,7 @@ TILE_PX = 26
 # Two stars' brightnesses: white, and 8 magnitudes under it, as faint as a 10-bit monitor is asked
 # to show.
 FAINTER_MAG = 8.0
-SMALL_SIGMA_PX = 0.4
+SMALL_SIGMA_PX = 0.4  # of a star that sampling at pixel centres spoils
 TABLE_SIZES = (64, 512, 4096)
 # float32 rounds a star's electrons by 6e-8, and its brightest pixels by as much again.
 ROUNDING_MAG = 1e-7

@@ -48,16 +48,16 @@ from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
 
 SPRITE_PSF = GaussianPsf(RenderSettings().sprite_sigma_px)
-NO_LIMIT_V_MAG = 20.0
-ATTITUDES = 60
+NO_LIMIT_V_MAG = 20.0  # fainter than all of Hipparcos
+ATTITUDES = 60  # random fields
 SEED = 1
 STAR_COLUMNS = ("hip", "vectors", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
 CELLS_DEG = (1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
 # float64 places of 2000 px are a few steps of 2.3e-13 px off.
 ROUNDING_PX = 1e-12
-SAMPLE_MS = 50
+SAMPLE_MS = 50  # between attitudes
 FRAME_HZ = 60
-PREDICTIONS = 60
+PREDICTIONS = 60  # attitudes that are timed as one work
 RATE_DEG_S = (0.7, -0.7, 5.0)
 EVENLY = (4, 8, 16, 32, 64)
 GAUSS = (8, 16, 24, 32)
@@ -66,7 +66,7 @@ EXACT_NODES = 200
 # Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21
 # sigma on either side.
 WIDE_PX = 24
-STARS_ACROSS = 16
+STARS_ACROSS = 16  # of a square grid
 # float32 fluxes and fractions of the sprites: 6e-8 of each.
 ROUNDING_SHARE = 1e-7
 MARGIN_PX = SPRITE_PSF.footprint_px / 2 + 1  # beyond the image, from where sprites reach into it

@@ -170,6 +170,8 @@ def _fit(together: FloatArray, samples: list[int]) -> _Fit | None:
     is nearly a mixture of the others.
     """
     gram = together[np.ix_(samples, samples)]
+    # The determinant is the square of their volume. Colours within MIXED_WITHIN of each other, by
+    # which a mixture may be off, span its square at most.
     if np.linalg.det(gram) <= MIXED_WITHIN**4:
         return None
     wanted = together[:, samples]

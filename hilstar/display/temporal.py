@@ -96,10 +96,12 @@ class TemporalQuantiser(ExactQuantiser):
         return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
+        """At most MAX_CARRIED_STEPS of each star's largest step."""
         limit = np.float32(MAX_CARRIED_STEPS) * step.max(axis=0)
         return np.clip(error, -limit, limit)
 
     def _keep(self, sprites: FrameLight, left: Float32Array) -> None:
+        """Keep what the last sprite of each star leaves, for the next frame."""
         _, last = ends_of_paths(sprites)
         self.left = Left(sprites.star[last].copy(), left[:, last])
 

@@ -30,6 +30,7 @@ WORTH_A_GROUP_PX = 4096
 MAX_LISTED = 1 / 16
 LEAST_PX = 1e-6  # as in splat.frag
 MARGIN_PX = 0.001  # as in star.vert
+ROUNDED_DOWN = 1 - 1e-6  # float32 light times gain may be rounded up to the first threshold
 NOWHERE: IntArray = np.empty(0, dtype=np.intp)
 
 
@@ -153,7 +154,7 @@ class CpuStars:
         self._most_gain = 1.0 if gain is None else float(gain.max())
         thresholds = RoundQuantiser.edges_e_per_s(panel)
         self._counter = ThresholdCounter(thresholds)
-        self._dark_e_per_s = float(thresholds[0]) / self._most_gain * (1 - 1e-6)
+        self._dark_e_per_s = float(thresholds[0]) / self._most_gain * ROUNDED_DOWN
         self._level_light = panel.light_e_per_s()
         self._axes_px2 = np.array(units.axes_px2, dtype=np.float32)
         self._drawn: IntArray | None = None  # places of the last frame's squares; None: anywhere
@@ -179,6 +180,7 @@ class CpuStars:
         self._drawn = NOWHERE
 
     def _images(self) -> list[npt.NDArray[Any]]:
+        """The levels and the sums, which a frame changes in the same places."""
         if self._fine_sums is None:
             fine = []
         else:

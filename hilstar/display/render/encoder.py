@@ -528,6 +528,7 @@ class Encoder:
             self._draw_tiles(tiles, uniforms)
 
     def _bind(self) -> None:
+        """Bind the linear image and the tables for the next pass."""
         for unit, texture in enumerate(self._textures.values()):
             texture.use(unit)
         if self._linear_image is not None:
@@ -536,6 +537,7 @@ class Encoder:
             block.bind_to_uniform_block(place)
 
     def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
+        """Encode tiles: of the linear image where it has them, of their own light, or white."""
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = (
@@ -558,6 +560,7 @@ class Encoder:
 
 
 def _rows(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Values (n,) in rows of TABLE_WIDTH, with 0 after the last."""
     rows = -(-len(values) // TABLE_WIDTH)
     padded = np.zeros((rows, TABLE_WIDTH), dtype=values.dtype)
     padded.ravel()[: len(values)] = values

@@ -29,6 +29,8 @@ WINGS, DENSER_WINGS = 128, 8
 # 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
+# float32 light may be rounded up by 1e-7 of it, star by star: the bound of a sum must not be passed
+ROUNDED_UP = 1.000001
 
 
 class LightUnits:
@@ -85,7 +87,8 @@ class LightUnits:
             return self.most_e_per_s
         white_e_per_s = np.float32(self.most_e_per_s / self._peak_share)
         rates = np.minimum(sprites.data["electrons_per_s"], white_e_per_s)
-        most_e_per_s = float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001
+        total_e_per_s = float(rates.sum(dtype=np.float64))
+        most_e_per_s = total_e_per_s * self._peak_share * ROUNDED_UP
         most_e_per_s = max(most_e_per_s, self.most_e_per_s)
         room = max_sum - len(sprites)
         exponent = math.ceil(math.log2(most_e_per_s / room))

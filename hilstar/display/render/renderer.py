@@ -81,16 +81,13 @@ class Renderer(Backend):
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
         self._by_pixel = quantiser.by_pixel()
-        self._by_star = (
-            quantiser
-            if target.response is not None and issubclass(quantiser, ExactQuantiser)
-            else None
-        )
+        self._by_star: type[ExactQuantiser] | None = None
+        if target.response is not None and issubclass(quantiser, ExactQuantiser):
+            self._by_star = quantiser
         self._last_frame = NO_FRAME
         self.context = self._ctx = context or create_context()
-        self.gl_renderer, self.gl_version = (
-            str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION")
-        )
+        self.gl_renderer = str(self._ctx.info["GL_RENDERER"])
+        self.gl_version = str(self._ctx.info["GL_VERSION"])
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
@@ -111,6 +108,7 @@ class Renderer(Backend):
             raise
 
     def _build(self) -> None:
+        """Make images and programs; those of levels only where there is a response."""
         ctx = self._ctx
         target = self.target
         ctx.enable(moderngl.PROGRAM_POINT_SIZE)
@@ -136,6 +134,7 @@ class Renderer(Backend):
         self._is_cpu_image = False  # where the last draw is
 
     def _build_levels(self) -> None:
+        """Make what turns light into levels, and choose the path of frames of stars alone."""
         target = self.target
         panel = self._panel
         # What turns light into codes; a window adds its own.

@@ -230,6 +230,7 @@ def _pitch_findings(state: OutputState, pixel_pitch_um: float) -> Iterator[Findi
 
 
 def _geometry_findings(state: OutputState) -> Iterator[Finding]:
+    """What scales, turns or copies frames on their way to an output."""
     off = np.abs(np.subtract(state.transform, IDENTITY)).max()
     if off > TRANSFORM_TOLERANCE:
         mend = f"xrandr --output {state.name} --transform none"

@@ -132,7 +132,7 @@ def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None
 
 
 def public(name: str) -> str:
-    """A function's name as a command's."""
+    """A command's name from its function's: first-light from first_light."""
     return name.strip("_").replace("_", "-")
 
 
@@ -152,8 +152,8 @@ def members(group: str) -> list[str]:
 
 @cache
 def application(only: str | None = None) -> typer.Typer:
-    """The commands of `hilstar`, or `only` the command or group of a name: each imports its
-    file, and all take 50 ms.
+    """The commands of `hilstar`; with `only`, that command or group alone, as importing all of them
+    takes 50 ms.
     """
     app = typer.Typer(
         cls=Commands,
@@ -177,7 +177,7 @@ def application(only: str | None = None) -> typer.Typer:
 
 @cache
 def built(only: str | None) -> Any:
-    """What typer makes of an application."""
+    """An application as typer runs it."""
     return typer.main.get_command(application(only))
 
 

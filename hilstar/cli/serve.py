@@ -157,7 +157,7 @@ class ServeOptions:
 
 @struct
 class HeadOptions:
-    """What the process of several heads gives that of one head."""
+    """What `serve` of several heads gives the process of one head."""
 
     head_of: Path | None = option("", "The file with `heads`.", hidden=True)
     fed_by: str | None = option("", "The endpoint of the source's attitudes.", hidden=True)
@@ -272,8 +272,8 @@ def heads_run(
     run: RunOptions,
     page: ActingPageOptions,
 ) -> "HeadsRun":
-    """A run of several heads, whose processes get the options that each can take. Raises InputError
-    for those of one bench.
+    """The run of several heads, with the options that go to each head's process. Raises InputError
+    for options of one bench.
     """
     from hilstar.server.heads import HeadsRun
 
@@ -311,9 +311,7 @@ def heads_run(
 
 
 def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
-    """The run as its page says it; where SCPI steers, with the port of the link to which it
-    sends.
-    """
+    """What the page says of the run; where SCPI steers, also the port to which SCPI sends."""
     from hilstar.server.console.publisher import RunDescription
 
     source = file.config.attitude

@@ -335,7 +335,9 @@ def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
 
 
 def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
-    """Who finds attitudes lost in space; None: the true one is taken. Raises InputError."""
+    """The solver of attitudes lost in space; None where the true attitude is taken. Raises
+    InputError.
+    """
     import numpy as np
 
     from hilstar.tracker.identify import LostInSpace

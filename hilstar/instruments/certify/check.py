@@ -239,7 +239,7 @@ class _Codes:
         _, place, count = np.unique(readings.code, return_inverse=True, return_counts=True)
         light = np.array(readings.light)
         mean = np.bincount(place, light) / count
-        squares = np.bincount(place, (light - mean[place]) ** 2)
+        squares = np.bincount(place, (light - mean[place]) ** 2).astype(np.float64)
         return cls(mean, count.astype(np.float64), squares)
 
     @property

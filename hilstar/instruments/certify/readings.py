@@ -236,7 +236,8 @@ class VirtualReader:
         psf = float(np.hypot(*widths)) / math.sqrt(2)
         noisy = psf * (1 + psf_u * float(self._rng.standard_normal()))
         columns = np.stack([x, y, seen_x, seen_y, light])[:, is_visible]
-        return DotReadings(*columns, noisy, psf * psf_u)
+        x, y, seen_x, seen_y, light = columns
+        return DotReadings(x, y, seen_x, seen_y, light, noisy, psf * psf_u)
 
     def delays_ms(self) -> FloatArray:
         """A simulated photodiode."""
@@ -358,7 +359,7 @@ class ImageReader:
         y = y_px.astype(np.float64)
         expected = np.stack(geometry.to_tracker(x, y), axis=1)
         places = np.stack([stars.x_px, stars.y_px], axis=1)
-        far, near = cKDTree(places).query(expected)
+        far, near = (np.asarray(part) for part in cKDTree(places).query(expected))
         seen = (far < APART_TRACKER_PX / 2) & ~stars.at_edge[near]
         if seen.sum() < MIN_DOTS:
             raise InputError(
@@ -369,8 +370,8 @@ class ImageReader:
         screen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True, psf_sigma_px=sigma_px)
         sharp = seen_sharpness(image, screen, self.file.config.tracker.detector, images)
         seen_px = stars.x_px[near[seen]], stars.y_px[near[seen]]
-        nearest, _ = cKDTree(expected).query(expected, k=2)
-        half_apart = int(nearest[:, 1].min()) // 2
+        apart = np.asarray(cKDTree(expected).query(expected, k=2)[0])
+        half_apart = int(apart[:, 1].min()) // 2
         reach = math.ceil(DOT_REACH_SIGMAS * dot_sigma_px(self.file))
         light = light_in_squares(image, *seen_px, min(reach, half_apart))
         psf = sharp.psf_sigma_px, sharp.psf_sigma_error_px

@@ -241,7 +241,8 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
         return repeat, 0.0
     within = max(within, FLOOR_RAD**2)
     free_between = axes * (groups - 1)
-    squares = count[:, None] * (means - part.mean(axis=0)) ** 2
+    off = means - part.mean(axis=0)
+    squares = count[:, None] * off**2
     between = float(squares.sum()) / free_between
     if between / within <= _f_limit(free_between, free_within):
         return repeat, 0.0

@@ -232,7 +232,8 @@ def fit_rotation(rotations: FloatArray) -> RotationFit:
     q, angle = start_of(rotations)
     near = angle <= AGREE_RAD
     q = _moved(q, np.median(_residuals(rotations[near], q), axis=0))
-    cut = CUT_SIGMAS * (1 + (FEW / max(int(near.sum()), 1)) ** 2)
+    pairs = max(int(near.sum()), 1)
+    cut = CUT_SIGMAS * (1 + (FEW / pairs) ** 2)
     for _ in range(ROUNDS):
         residual = _residuals(rotations, q)
         weight = _weights(residual, near, cut)

@@ -237,7 +237,8 @@ def _black_error(best: "_Solution", levels: measurements.MeasuredLevels, scale: 
     own_error = scale * problem.black_sigma * math.sqrt(black_variance)
     common_error = float(np.linalg.norm(levels.common[0]))
     count = len(best.theta)
-    white_variance = _variances(problem.at_codes[-1:], best.covariance[:count, :count])[0]
+    shape_covariance = best.covariance[:count, :count]
+    white_variance = _variances(problem.at_codes[-1:], shape_covariance)[0]
     white_error = math.sqrt(max(white_variance, 0.0))
     return math.hypot(own_error, common_error, best.black * scale * white_error)
 
@@ -542,7 +543,8 @@ def _additivity(fits: dict[str, ChannelFit]) -> dict[str, Any]:
     primaries = [fits[name] for name in measurements.PRIMARIES]
     white = fits["w"]
     together = np.sum([fit.white * fit.light for fit in primaries], axis=0)
-    excess = 100 * (together / np.maximum(white.white * white.light, 1e-300) - 1)
+    white_light = np.maximum(white.white * white.light, 1e-300)
+    excess = 100 * (together / white_light - 1)
     places = list(_decades(white).values())
     errors = []
     for fit in primaries:

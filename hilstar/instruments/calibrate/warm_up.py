@@ -308,7 +308,8 @@ def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArra
     used = t_s >= found.from_s
     if found.law != "none":
         law = _laws(t_s[used], light[used])[found.law == "exponential"]
-        drawn[used] = light[used] - float(np.median(light[used])) * law.residual
+        white = float(np.median(light[used]))
+        drawn[used] = light[used] - white * law.residual
     return drawn
 
 
@@ -325,8 +326,9 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
     longest_s = MAX_TAU * float(time[-1])
     tried = np.linspace(math.log(shortest_s), math.log(longest_s), TAUS)
     best = int(np.argmin([misfit(log_tau) for log_tau in tried]))
-    bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
-    log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+    lowest = tried[max(best - 1, 0)]
+    highest = tried[min(best + 1, TAUS - 1)]
+    log_tau = float(minimize_scalar(misfit, bounds=(lowest, highest), method="bounded").x)
     margin = END_SHARE * (tried[1] - tried[0])
     at_end = not tried[0] + margin < log_tau < tried[-1] - margin
     exponential = _law(time, value, math.exp(log_tau))

@@ -42,10 +42,11 @@ from hilstar.server.bench.cameras import (
     ideal_monitor,
     tracker_camera,
 )
-from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.config import Monitor, parse_config
 from hilstar.server.bench.monitor import calibration_source
 from hilstar.server.sync import BeatSummary
 from hilstar.tracker.mosaic import software_image
+from hilstar.tracker.settings import DetectorSettings
 
 Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str
@@ -278,14 +279,24 @@ class StepContext:
     stage: Callable[[str], object] = lambda words: None
 
     @property
+    def monitor(self) -> Monitor:
+        """The bench file's [monitor]."""
+        return self.file.config.monitor
+
+    @property
+    def detector(self) -> DetectorSettings:
+        """The bench file's [tracker.detector]."""
+        return self.file.config.tracker.detector
+
+    @property
     def resolution_px(self) -> tuple[int, int]:
         """Size of the monitor's image."""
-        return self.file.config.monitor.resolution_px
+        return self.monitor.resolution_px
 
     @property
     def white(self) -> int:
         """The largest code."""
-        return int(2**self.file.config.monitor.bits - 1)
+        return int(2**self.monitor.bits - 1)
 
     @property
     def truth(self) -> BenchFile | None:
@@ -448,5 +459,5 @@ def darker_code(code: int) -> int:
 
 def calibration_of(context: StepContext) -> Calibration:
     """The calibration that the bench file names."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     return load_calibration(calibration_source(monitor, context.file.folder), monitor.bits)

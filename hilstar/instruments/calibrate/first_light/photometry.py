@@ -58,7 +58,7 @@ DIM_LIGHT = 1e-3  # relative to white: how far down responses are compared
 
 def photometry(context: StepContext) -> StepOutcome:
     """Measure the response and name its file in the bench file. Raises InputError."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     if not context.patches:
         how = (
             "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar"
@@ -244,7 +244,7 @@ def _judged(
     limits of [verify].
     """
     limit_mag = context.file.config.verify.flux_mag
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     is_black_measured = figures["black_level_measured"] == "yes"
     black = f"black {figures['black_level']:.2e} of white as the bench file has it, not measured"
     if is_black_measured:
@@ -292,8 +292,10 @@ def response_error_mag(assumed: Response, true: Response) -> FloatArray:
     """How much fainter each code is than assumed (n,), magnitudes, from three decades below
     white to white.
     """
-    is_bright = true.light[1:] >= DIM_LIGHT
-    return np.asarray(magnitude(true.light[1:][is_bright] / assumed.light[1:][is_bright]))
+    true_light = true.light[1:]
+    is_bright = true_light >= DIM_LIGHT
+    ratio = true_light[is_bright] / assumed.light[1:][is_bright]
+    return np.asarray(magnitude(ratio))
 
 
 def exponent(response: Response) -> float:

@@ -89,7 +89,7 @@ class StarSpot:
             drawn_px = ratio * math.sqrt(sprite_px**2 + squares_px2)
             sigmas_px.append(math.hypot(psf_scale * psf_width_px, drawn_px))
         x_px, y_px = sigmas_px
-        detector = context.file.config.tracker.detector
+        detector = context.detector
         electronics_dn = detector.electronics_e / detector.gain_e_per_dn
         return cls((x_px, y_px), detector.gain_e_per_dn, detector.prnu, electronics_dn)
 
@@ -168,10 +168,10 @@ class StarSpot:
         return np.interp(dn, points_dn, noise_mag, left=np.inf)
 
     def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
-        """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
+        """What the ADC's rounding adds to the windows of stars of `dn` (n,) in all, DN: (n,
+        STEP_PHASES), by where the dark level lies between two codes (see `rounded_light`).
 
-        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's,
-        in the mean of the frames.
+        `noise_dn` is that of a pixel above its dark frame, in the mean of the frames.
         """
         shares, _ = self._shares
         pixel_shares = shares.ravel()

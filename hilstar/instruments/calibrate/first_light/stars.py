@@ -276,7 +276,7 @@ def _light_figures(
     """
     sure = seen.sure
     asked_e = seen.e_per_s[sure] * context.exposure_s
-    seen_e = seen.dn[sure] * context.file.config.tracker.detector.gain_e_per_dn
+    seen_e = seen.dn[sure] * context.detector.gain_e_per_dn
     off_mag = np.asarray(magnitude(seen_e / asked_e))
     noise_mag = seen.noise_mag[sure]
     zero_point_mag = float(np.median(off_mag))
@@ -383,7 +383,7 @@ def scale(context: StepContext) -> StepOutcome:
         )
     asked = stars_seen.e_per_s[used]
     noise_mag = stars_seen.noise_mag[used]
-    seen_e = stars_seen.dn[used] * context.file.config.tracker.detector.gain_e_per_dn
+    seen_e = stars_seen.dn[used] * context.detector.gain_e_per_dn
     ratios = seen_e / (asked * context.exposure_s)
     ratios_mag = np.asarray(magnitude(ratios))
     star_scale = scale_of(white, ratios, noise_mag)

@@ -90,7 +90,8 @@ class Model:
     @property
     def size(self) -> int:
         """How many numbers the model has."""
-        return len(self.names) + len(self.tracker_names) + 3 * (self.poses - 1)
+        lens_numbers = len(self.names) + len(self.tracker_names)
+        return lens_numbers + 3 * (self.poses - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +146,7 @@ def geometry_of(
 
 
 def _tracker_lens(names: tuple[str, ...], numbers: FloatArray) -> Lens:
-    """The tracker's own lens by its parameters' numbers, which others may follow."""
+    """The tracker's own lens by the numbers of its parameters; further ones are not read."""
     values = {}
     for name, number in zip(names, numbers, strict=False):
         values[name] = TRACKER_STEPS[name] * float(number)
@@ -303,7 +304,7 @@ class _Loss:
         return weight**2
 
     def value(self, off: FloatArray, numbers: FloatArray) -> float:
-        """The loss by its residuals and numbers."""
+        """The loss: Huber's of the residuals, and the prior of the numbers."""
         size = np.abs(off)
         losses = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
         prior_loss = 0.5 * self.prior(len(numbers)) @ numbers**2
@@ -579,7 +580,8 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     map_x_px, map_y_px = _grid_px(fit.geometry.monitor.resolution_px, MAP_PLACES)
     map_places = np.stack(_slopes_of_places(problem, fit, map_x_px, map_y_px))
     slopes = map_places @ root * to_arcsec
-    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
+    columns, rows = MAP_PLACES
+    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(rows, columns)
     # a place that was not seen has those of its neighbour
     slopes = slopes[:, _nearest_true(is_visible).ravel()]
     variance = (slopes**2).sum(axis=(0, 2)).reshape(is_visible.shape)

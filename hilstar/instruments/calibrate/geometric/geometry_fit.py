@@ -73,8 +73,8 @@ ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the scr
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and
-    the centroids' fate.
+    """The result of a geometric calibration: the fit and its uncertainty, the models that were
+    compared, and how many `centroids` were given.
     """
 
     problem: fits.Problem
@@ -404,8 +404,8 @@ class FittedParameter(NamedTuple):
 
 
 def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
-    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its
-    own lens.
+    """The figures of a calibration, by the keys of --json; `tracker` says whether its own lens was
+    "held" or "fitted".
     """
     chosen = found.chosen
     models = []

@@ -164,15 +164,18 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
         rate_rad_s = pairs.rate_rad_s[used]
     covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
     commanded = pairs.commanded[used]
+    residual = residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q)
+    q_nominal = from_matrix(camera.cam_to_image)
+    wild = tuple(pairs.line[~used].tolist())
     return Aligned(
         pairs=pairs,
         fit=fit,
-        residual=residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q),
+        residual=residual,
         camera=camera,
-        q_cam_to_mon=corrected(from_matrix(camera.cam_to_image), fit.q),
+        q_cam_to_mon=corrected(q_nominal, fit.q),
         covariance_arcsec2=ARCSEC_PER_RAD**2 * covariance,
         dof=dof,
-        wild=tuple(pairs.line[~used].tolist()),
+        wild=wild,
     )
 
 

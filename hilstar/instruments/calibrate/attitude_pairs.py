@@ -147,12 +147,15 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
             f"{path}: its times, {times}, meet no frame of {ledger}, lit from {lit} on the sender's"
             " clock; write t_s on that clock, or add --offset-s"
         )
+    line = telemetry.line[valid]
+    reported = telemetry.q[valid]
+    skipped = len(valid) - int(known.sum())
     return Pairs(
         source=path,
-        line=telemetry.line[valid][known],
+        line=line[known],
         commanded=moments.q[known],
-        reported=telemetry.q[valid][known],
-        skipped=len(valid) - int(known.sum()),
+        reported=reported[known],
+        skipped=skipped,
         rate_rad_s=moments.rate_rad_s[known],
         names=COMMANDED,
     )

@@ -221,17 +221,19 @@ def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
     to_square_ms = swap_to_square_ms(config.monitor)
     p1, p50, p99 = np.percentile(ms, [1, 50, 99]).tolist()
     jitter_ms = float(ms.std())
+    latency_ms = {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())}
+    median_error_ms = ERROR_OF_MEDIAN * jitter_ms / math.sqrt(len(ms))
     return {
         "edges": len(ms),
         "unmatched": paired.unmatched,
         "ambiguous": paired.ambiguous,
-        "latency_ms": {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())},
+        "latency_ms": latency_ms,
         "jitter_ms": jitter_ms,
         "rise_ms": _median(ms[paired.level == 1]),
         "fall_ms": _median(ms[paired.level == 0]),
         "swap_to_square_ms": to_square_ms,
         "panel_delay_ms": p50 - to_square_ms,
-        "panel_delay_u_ms": ERROR_OF_MEDIAN * jitter_ms / math.sqrt(len(ms)),
+        "panel_delay_u_ms": median_error_ms,
         "beat": asdict(beat(exposures_of(config))),
     }
 

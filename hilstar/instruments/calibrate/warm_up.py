@@ -283,12 +283,15 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
         tau_s = float(law.parameters[2])
         stable_s = max(stable_s, 0.0)
     bound = abs(ahead) + stdtrit(end.dof, CONFIDENCE) * ahead_error
+    if not stable_s:
+        stable_error_s = 0.0
+    start_s = float(t_s[0])
     return WarmUp(
         law=name,
         is_stable=bool(bound < limit),
         limit=limit,
-        stable_after_s=float(t_s[0]) + stable_s,
-        stable_after_error_s=stable_error_s if stable_s else 0.0,
+        stable_after_s=start_s + stable_s,
+        stable_after_error_s=stable_error_s,
         drift_percent_per_h=100 * S_PER_H * slope,
         drift_error_percent_per_h=100 * S_PER_H * slope_error,
         ahead=ahead,
@@ -296,7 +299,7 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
         tau_s=tau_s,
         noise=law.noise,
         dof=end.dof,
-        from_s=float(t_s[0]),
+        from_s=start_s,
     )
 
 

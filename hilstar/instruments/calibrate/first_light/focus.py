@@ -198,9 +198,12 @@ def sharpness(
     by_scatter = float(np.std(dot_sigmas)) / math.sqrt(len(dot_sigmas))
     by_model = math.hypot(MODEL_SHARE * sigma_px, EDGE_SHARE * fit.shape.side_px)
     error_px = math.hypot(max(fit.sigma_error_px, by_scatter), by_model)
+    # a place of the fit is from the middle of its dot's pixel
+    x_px = np.rint(dots.x_px) + fit.places[:, 0]
+    y_px = np.rint(dots.y_px) + fit.places[:, 1]
     return Sharpness(
-        x_px=np.rint(dots.x_px) + fit.places[:, 0],
-        y_px=np.rint(dots.y_px) + fit.places[:, 1],
+        x_px=x_px,
+        y_px=y_px,
         each_psf_sigma_px=dot_sigmas,
         psf_sigma_px=sigma_px,
         psf_sigma_error_px=error_px,

@@ -747,13 +747,14 @@ class Photometer:
         else:
             variance += dark_more / more**2 + dark_less / less**2
         ratio = float(np.mean(pair.ratios))
+        error = ratio * math.sqrt(variance / len(pair.ratios))
         return LatticeRatio(
             patch=pair.patch,
             dense=pair.more.period,
             sparse=pair.less.period,
             ratio=ratio,
             pairs=pair.ratios,
-            error=ratio * math.sqrt(variance / len(pair.ratios)),
+            error=error,
             times=(pair.more.times, pair.less.times),
         )
 

@@ -196,19 +196,24 @@ def _response_figures(
     ratios = [f"{link.ratio:.4f}" for link in readings.links]
     links_mag = [abs(float(magnitude(link.ratio))) for link in readings.links]
     links_sigmas = [link.sigmas for link in readings.links]
+    off_rms_mag = float(np.sqrt((off_mag**2).mean()))
+    off_max_mag = float(np.abs(off_mag).max())
+    held_out_rms_mag = max(holdout["rms_mag"] for holdout in holdouts)
+    held_out_max_mag = max(holdout["max_mag"] for holdout in holdouts)
+    held_out_sigmas = max(holdout["p95_sigmas"] for holdout in holdouts)
     figures: dict[str, Figure] = {
         "gamma": exponent(now),
         "gamma_in_bench_file": exponent(before),
-        "bench_file_off_rms_mag": float(np.sqrt((off_mag**2).mean())),
-        "bench_file_off_max_mag": float(np.abs(off_mag).max()),
+        "bench_file_off_rms_mag": off_rms_mag,
+        "bench_file_off_max_mag": off_max_mag,
         "black_level": now.black,
         "black_level_error": black_error,
         "black_level_in_bench_file": before.black,
         "black_level_measured": black_measured,
-        "held_out_rms_mag": max(holdout["rms_mag"] for holdout in holdouts),
+        "held_out_rms_mag": held_out_rms_mag,
         "held_out_p95_mag": MAG_PER_RELATIVE * p95_percent / 100,
-        "held_out_p95_sigmas": max(holdout["p95_sigmas"] for holdout in holdouts),
-        "held_out_max_mag": max(holdout["max_mag"] for holdout in holdouts),
+        "held_out_p95_sigmas": held_out_sigmas,
+        "held_out_max_mag": held_out_max_mag,
         "noise_percent": 100 * found["noise_relative"],
         "drift_percent": drift_percent,
         "patches": len(readings.patches),

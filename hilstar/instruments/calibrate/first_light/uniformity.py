@@ -385,10 +385,12 @@ def _in_words(light_map: UniformityMap, is_known_uneven: bool) -> str:
 def _figures(
     context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap
 ) -> dict[str, Figure]:
+    wild_dots = int((~found.used).sum())
+    rows, columns = found.grid.shape
     figures: dict[str, Figure] = {
         "dots": len(dots.light),
-        "wild_dots": int((~found.used).sum()),
-        "grid": " x ".join(map(str, found.grid.shape)),
+        "wild_dots": wild_dots,
+        "grid": f"{rows} x {columns}",
         "darkest_of_brightest": found.darkest_of_brightest,
         "change_rms_mag": found.rms_mag,
         "off_bench_file_rms_mag": against.rms_mag,
@@ -586,13 +588,14 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
         noise = square * (maps.freedom(nearest) - freedom) / count
         gain_error = float(gain.std()) / math.sqrt(count)
         missed = _not_negative(float(gain.mean()) + noise, gain_error)
+    fit_variance = square * freedom / count
     return UniformityMap(
         grid.reshape(shape),
         design @ grid,
         left_mag=MAG_PER_RELATIVE * math.sqrt(square),
         left_error_mag2=MAG_PER_RELATIVE**2 * error,
         used=used,
-        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedom / count),
+        fit_mag=MAG_PER_RELATIVE * math.sqrt(fit_variance),
         missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
     )
 

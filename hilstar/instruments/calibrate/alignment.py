@@ -164,15 +164,18 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
         rate_rad_s = pairs.rate_rad_s[used]
     covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
     commanded = pairs.commanded[used]
+    residual = residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q)
+    q_nominal = from_matrix(camera.cam_to_image)
+    wild = tuple(pairs.line[~used].tolist())
     return Aligned(
         pairs=pairs,
         fit=fit,
-        residual=residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q),
+        residual=residual,
         camera=camera,
-        q_cam_to_mon=corrected(from_matrix(camera.cam_to_image), fit.q),
+        q_cam_to_mon=corrected(q_nominal, fit.q),
         covariance_arcsec2=ARCSEC_PER_RAD**2 * covariance,
         dof=dof,
-        wild=tuple(pairs.line[~used].tolist()),
+        wild=wild,
     )
 
 
@@ -241,7 +244,8 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
         return repeat, 0.0
     within = max(within, FLOOR_RAD**2)
     free_between = axes * (groups - 1)
-    squares = count[:, None] * (means - part.mean(axis=0)) ** 2
+    off = means - part.mean(axis=0)
+    squares = count[:, None] * off**2
     between = float(squares.sum()) / free_between
     if between / within <= _f_limit(free_between, free_within):
         return repeat, 0.0

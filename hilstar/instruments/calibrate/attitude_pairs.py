@@ -147,12 +147,15 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
             f"{path}: its times, {times}, meet no frame of {ledger}, lit from {lit} on the sender's"
             " clock; write t_s on that clock, or add --offset-s"
         )
+    line = telemetry.line[valid]
+    reported = telemetry.q[valid]
+    skipped = len(valid) - int(known.sum())
     return Pairs(
         source=path,
-        line=telemetry.line[valid][known],
+        line=line[known],
         commanded=moments.q[known],
-        reported=telemetry.q[valid][known],
-        skipped=len(valid) - int(known.sum()),
+        reported=reported[known],
+        skipped=skipped,
         rate_rad_s=moments.rate_rad_s[known],
         names=COMMANDED,
     )
@@ -232,7 +235,8 @@ def fit_rotation(rotations: FloatArray) -> RotationFit:
     q, angle = start_of(rotations)
     near = angle <= AGREE_RAD
     q = _moved(q, np.median(_residuals(rotations[near], q), axis=0))
-    cut = CUT_SIGMAS * (1 + (FEW / max(int(near.sum()), 1)) ** 2)
+    pairs = max(int(near.sum()), 1)
+    cut = CUT_SIGMAS * (1 + (FEW / pairs) ** 2)
     for _ in range(ROUNDS):
         residual = _residuals(rotations, q)
         weight = _weights(residual, near, cut)

@@ -191,7 +191,7 @@ def _dot_sides(data: MatchedDots, x_px: FloatArray, y_px: FloatArray) -> FloatAr
     """The side of a dot where each centroid is, tracker px (n,), by a cubic map from the tracker
     to the monitor.
     """
-    tracker_px = np.stack([data.seen.x_px, data.seen.y_px], axis=1)
+    tracker_px = np.stack([data.centroids.x_px, data.centroids.y_px], axis=1)
     monitor_px = np.stack([x_px[data.dot], y_px[data.dot]], axis=1)
     middle = tracker_px.mean(axis=0)
     scale = float(np.abs(tracker_px - middle).max())
@@ -287,22 +287,22 @@ def cut_out(
     """The mean image of each dot in each pose over the frames in which none lies near it. Raises
     InputError.
     """
-    _, dot = np.unique(np.stack([data.seen.pose, data.dot]), axis=1, return_inverse=True)
+    _, dot = np.unique(np.stack([data.centroids.pose, data.dot]), axis=1, return_inverse=True)
     dot = dot.ravel()
     count = np.bincount(dot)
-    x_px = np.bincount(dot, data.seen.x_px) / count
-    y_px = np.bincount(dot, data.seen.y_px) / count
+    x_px = np.bincount(dot, data.centroids.x_px) / count
+    y_px = np.bincount(dot, data.centroids.y_px) / count
     side_px = np.bincount(dot, sides_px) / count
     places = _Places.of(x_px, y_px, side_px)
     sums = _Sums.none(len(count))
     for (frame, pose), path in paths.items():
-        in_frame = np.flatnonzero((data.seen.frame == frame) & (data.seen.pose == pose))
+        in_frame = np.flatnonzero((data.centroids.frame == frame) & (data.centroids.pose == pose))
         if not len(in_frame):
             continue
         image = read_image(path, resolution_px)
         if dark is not None:
             image = image - dark
-        is_alone = _is_alone(data.seen.x_px[in_frame], data.seen.y_px[in_frame])
+        is_alone = _is_alone(data.centroids.x_px[in_frame], data.centroids.y_px[in_frame])
         alone = dot[in_frame[is_alone]]
         sums.add(alone, places.cutouts(image, alone))
     return _of_frames(sums, places)

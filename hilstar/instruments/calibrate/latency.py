@@ -111,7 +111,8 @@ def read_edges(path: Path) -> Edges:
             fault = f"not a file of edges ({shortened(repr(error))}); {EDGE_ADVICE}"
             raise InputError(f"{path}:{line}: {fault}") from error
         rows.append((host_ns, level))
-    if len(rows) < MIN_EDGES or any(level not in {0, 1} for _, level in rows):
+    are_levels_known = all(level in {0, 1} for _, level in rows)
+    if len(rows) < MIN_EDGES or not are_levels_known:
         raise InputError(
             f"{path}: at least {MIN_EDGES} edges are needed, each of level 0 or 1; {EDGE_FORM}"
         )
@@ -179,8 +180,10 @@ def nearest_of(moments: IntArray, wanted: FloatArray) -> IntArray:
     """The member of sorted `moments` (m,) nearest to each of `wanted` (n,)."""
     after = np.minimum(np.searchsorted(moments, wanted), len(moments) - 1)
     before = np.maximum(after - 1, 0)
-    closer = np.abs(moments[after] - wanted) < np.abs(moments[before] - wanted)
-    return np.asarray(moments[np.where(closer, after, before)])
+    to_after = np.abs(moments[after] - wanted)
+    to_before = np.abs(moments[before] - wanted)
+    nearest = np.where(to_after < to_before, after, before)
+    return np.asarray(moments[nearest])
 
 
 def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
@@ -218,17 +221,19 @@ def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
     to_square_ms = swap_to_square_ms(config.monitor)
     p1, p50, p99 = np.percentile(ms, [1, 50, 99]).tolist()
     jitter_ms = float(ms.std())
+    latency_ms = {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())}
+    median_error_ms = ERROR_OF_MEDIAN * jitter_ms / math.sqrt(len(ms))
     return {
         "edges": len(ms),
         "unmatched": paired.unmatched,
         "ambiguous": paired.ambiguous,
-        "latency_ms": {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())},
+        "latency_ms": latency_ms,
         "jitter_ms": jitter_ms,
         "rise_ms": _median(ms[paired.level == 1]),
         "fall_ms": _median(ms[paired.level == 0]),
         "swap_to_square_ms": to_square_ms,
         "panel_delay_ms": p50 - to_square_ms,
-        "panel_delay_u_ms": ERROR_OF_MEDIAN * jitter_ms / math.sqrt(len(ms)),
+        "panel_delay_u_ms": median_error_ms,
         "beat": asdict(beat(exposures_of(config))),
     }
 

@@ -294,7 +294,8 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     value = measured.value[chosen]
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
     mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
-    squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
+    off = value - mean[place]
+    squares = np.asarray(np.bincount(place, off**2), dtype=np.float64)
     stated_variance = np.bincount(place, measured.sigma[chosen] ** 2) / count
     is_stated = bool(stated_variance.any())
     # What repeats scatter beyond the readings' own errors.
@@ -331,7 +332,8 @@ def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: 
     # F's quantile; scipy.stats has the same one and takes half a second to import
     from scipy.special import fdtri
 
-    faint = (np.arange(len(mean)) <= len(mean) // 3) & (count > 1)
+    levels = len(mean)
+    faint = (np.arange(levels) <= levels // 3) & (count > 1)
     freedom = count[faint] - 1
     dof = int(freedom.sum())
     if not dof or math.isnan(relative):

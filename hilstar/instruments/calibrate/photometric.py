@@ -210,13 +210,14 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     leverage = _variances(best.design, best.covariance)
     held_out_share = np.maximum(1 - leverage, 1e-6)
     level_sigma = problem.sigma / best.above
+    held_out_residual = best.misfit / held_out_share * problem.sigma / best.above
     return ChannelFit(
         light=light,
         white=white_light * scale,
         black=best.black * scale,
         error=np.append(0.0, lack * error),
         levels=levels,
-        residual=best.misfit / held_out_share * problem.sigma / best.above,
+        residual=held_out_residual,
         noise_relative=noise,
         shape=best.shape.name,
         parameters=best.parameters,
@@ -237,7 +238,8 @@ def _black_error(best: "_Solution", levels: measurements.MeasuredLevels, scale: 
     own_error = scale * problem.black_sigma * math.sqrt(black_variance)
     common_error = float(np.linalg.norm(levels.common[0]))
     count = len(best.theta)
-    white_variance = _variances(problem.at_codes[-1:], best.covariance[:count, :count])[0]
+    shape_covariance = best.covariance[:count, :count]
+    white_variance = _variances(problem.at_codes[-1:], shape_covariance)[0]
     white_error = math.sqrt(max(white_variance, 0.0))
     return math.hypot(own_error, common_error, best.black * scale * white_error)
 
@@ -332,6 +334,8 @@ def _problem(
         floor = STATED_FLOOR
     level_error = levels.standard_error(noise) / scale
     sigma = np.hypot(level_error, floor)
+    black = float(levels.mean[0] / scale)
+    common = (levels.common[1:] - levels.common[0]) / scale
     return _Problem(
         at_levels=columns(at),
         at_codes=columns(codes),
@@ -341,9 +345,9 @@ def _problem(
         prior=prior,
         light=levels.mean[1:] / scale,
         sigma=sigma[1:],
-        black=float(levels.mean[0] / scale),
+        black=black,
         black_sigma=float(sigma[0]),
-        common=(levels.common[1:] - levels.common[0]) / scale,
+        common=common,
     )
 
 
@@ -542,7 +546,8 @@ def _additivity(fits: dict[str, ChannelFit]) -> dict[str, Any]:
     primaries = [fits[name] for name in measurements.PRIMARIES]
     white = fits["w"]
     together = np.sum([fit.white * fit.light for fit in primaries], axis=0)
-    excess = 100 * (together / np.maximum(white.white * white.light, 1e-300) - 1)
+    white_light = np.maximum(white.white * white.light, 1e-300)
+    excess = 100 * (together / white_light - 1)
     places = list(_decades(white).values())
     errors = []
     for fit in primaries:
@@ -578,13 +583,17 @@ def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
     levels = fit.levels
     if math.isnan(levels.relative_noise) and not levels.has_errors:
         return None
+    level_light = fit.light[levels.code[1:]]
+    black = fit.black_error / fit.white
+    common = levels.standard_error(fit.noise_relative)[0] / fit.white
+    dof = float((levels.count - 1).sum())
     return ErrorsTable(
-        light=_rounded(fit.light[levels.code[1:]]),
+        light=_rounded(level_light),
         off=_rounded(fit.level_off),
         relative=_rounded(fit.level_error),
-        dof=float((levels.count - 1).sum()),
-        black=_rounded(fit.black_error / fit.white)[0],
-        common=_rounded(levels.standard_error(fit.noise_relative)[0] / fit.white)[0],
+        dof=dof,
+        black=_rounded(black)[0],
+        common=_rounded(common)[0],
     )
 
 
@@ -627,14 +636,16 @@ def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
     error_percent = {}
     for decade, code in _decades(fit).items():
         error_percent[f"1e-{decade}"] = 100 * float(fit.error[code])
+    repeats = {"min": int(count.min()), "max": int(count.max())}
+    black_level = {
+        "relative": fit.black / fit.white,
+        "unit": fit.black,
+        "error": fit.black_error / fit.white,
+    }
     return {
         "codes": len(count),
-        "repeats": {"min": int(count.min()), "max": int(count.max())},
-        "black_level": {
-            "relative": fit.black / fit.white,
-            "unit": fit.black,
-            "error": fit.black_error / fit.white,
-        },
+        "repeats": repeats,
+        "black_level": black_level,
         "noise_relative": fit.levels.reading_noise(fit.noise_relative),
         "lack_of_fit": fit.lack_of_fit,
         "shape": fit.shape,
@@ -653,14 +664,16 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     residual = np.abs(fit.residual[shown])
     sigmas = residual / fit.residual_error[shown]
     rms = float(np.sqrt((residual**2).mean()))
+    p95 = float(np.percentile(residual, 95))
+    p95_sigmas = float(np.percentile(sigmas, 95))
     largest = float(residual.max())
     return {
         "rms_percent": 100 * rms,
-        "p95_percent": 100 * float(np.percentile(residual, 95)),
+        "p95_percent": 100 * p95,
         "max_percent": 100 * largest,
         "rms_mag": MAG_PER_RELATIVE * rms,
         "max_mag": MAG_PER_RELATIVE * largest,
-        "p95_sigmas": float(np.percentile(sigmas, 95)),
+        "p95_sigmas": p95_sigmas,
     }
 
 

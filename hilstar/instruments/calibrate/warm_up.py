@@ -283,12 +283,15 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
         tau_s = float(law.parameters[2])
         stable_s = max(stable_s, 0.0)
     bound = abs(ahead) + stdtrit(end.dof, CONFIDENCE) * ahead_error
+    if not stable_s:
+        stable_error_s = 0.0
+    start_s = float(t_s[0])
     return WarmUp(
         law=name,
         is_stable=bool(bound < limit),
         limit=limit,
-        stable_after_s=float(t_s[0]) + stable_s,
-        stable_after_error_s=stable_error_s if stable_s else 0.0,
+        stable_after_s=start_s + stable_s,
+        stable_after_error_s=stable_error_s,
         drift_percent_per_h=100 * S_PER_H * slope,
         drift_error_percent_per_h=100 * S_PER_H * slope_error,
         ahead=ahead,
@@ -296,7 +299,7 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
         tau_s=tau_s,
         noise=law.noise,
         dof=end.dof,
-        from_s=float(t_s[0]),
+        from_s=start_s,
     )
 
 
@@ -308,7 +311,8 @@ def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArra
     used = t_s >= found.from_s
     if found.law != "none":
         law = _laws(t_s[used], light[used])[found.law == "exponential"]
-        drawn[used] = light[used] - float(np.median(light[used])) * law.residual
+        white = float(np.median(light[used]))
+        drawn[used] = light[used] - white * law.residual
     return drawn
 
 
@@ -325,8 +329,9 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
     longest_s = MAX_TAU * float(time[-1])
     tried = np.linspace(math.log(shortest_s), math.log(longest_s), TAUS)
     best = int(np.argmin([misfit(log_tau) for log_tau in tried]))
-    bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
-    log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+    lowest = tried[max(best - 1, 0)]
+    highest = tried[min(best + 1, TAUS - 1)]
+    log_tau = float(minimize_scalar(misfit, bounds=(lowest, highest), method="bounded").x)
     margin = END_SHARE * (tried[1] - tried[0])
     at_end = not tried[0] + margin < log_tau < tried[-1] - margin
     exponential = _law(time, value, math.exp(log_tau))

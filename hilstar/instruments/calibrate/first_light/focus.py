@@ -113,8 +113,9 @@ class Sharpness:
 
 
 class _Dots(NamedTuple):
-    """Squares of pixels (n, k, k), DN, about dots, and the dots' first places (n,), px; `half_px`
-    is half the side of a square, without its middle pixel.
+    """Squares of pixels (n, k, k), DN, about dots, and the dots' first places (n,), px.
+
+    A square reaches `half_px` from its middle pixel to each side.
     """
 
     values: FloatArray
@@ -197,9 +198,12 @@ def sharpness(
     by_scatter = float(np.std(dot_sigmas)) / math.sqrt(len(dot_sigmas))
     by_model = math.hypot(MODEL_SHARE * sigma_px, EDGE_SHARE * fit.shape.side_px)
     error_px = math.hypot(max(fit.sigma_error_px, by_scatter), by_model)
+    # a place of the fit is from the middle of its dot's pixel
+    x_px = np.rint(dots.x_px) + fit.places[:, 0]
+    y_px = np.rint(dots.y_px) + fit.places[:, 1]
     return Sharpness(
-        x_px=np.rint(dots.x_px) + fit.places[:, 0],
-        y_px=np.rint(dots.y_px) + fit.places[:, 1],
+        x_px=x_px,
+        y_px=y_px,
         each_psf_sigma_px=dot_sigmas,
         psf_sigma_px=sigma_px,
         psf_sigma_error_px=error_px,
@@ -330,8 +334,8 @@ def _weights(model: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoi
 
 
 class _NormalEquations(NamedTuple):
-    """The normal matrices (n, m, m) and right sides (n, m, 1) of dots' light, background, place
-    and what follows; and the sum of the squares of their residuals, in sigmas.
+    """Normal equations of each dot: matrices (n, m, m) and right sides (n, m, 1); the sum of the
+    squares of all residuals, in sigmas, and their number.
     """
 
     normal: FloatArray
@@ -560,14 +564,14 @@ def sharp_dots(context: StepContext) -> SharpDots:
     code = context.white
     plan = first_dots(seen_screen)
     dark = context.read(context.dark())
-    for number in range(context.file.config.monitor.bits * 2):
+    for number in range(context.monitor.bits * 2):
         codes = dot_image(plan, 0, context.resolution_px, code)
         looked = context.look(Pattern(f"dots_{number:03}", codes), dark)
         # a dot that saturates the detector looks wider than it is
         if looked.raw_peak < DOT_FILL * context.full_dn:
             break
         code = context.darker(code)
-    detector = context.file.config.tracker.detector
+    detector = context.detector
     return SharpDots(code, seen_sharpness(looked.image, seen_screen, detector), looked)
 
 

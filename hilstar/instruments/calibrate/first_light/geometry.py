@@ -227,7 +227,8 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
     shown_x, shown_y = geometry.to_monitor(x_px, y_px)
     corner, right, below = np.stack([shown_x, shown_y], axis=1)
-    figure_px = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
+    side_px = 2 * figure.reach_px
+    figure_px = np.column_stack([right - corner, below - corner]) / side_px
     scale = float(np.sqrt(abs(np.linalg.det(figure_px))))
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
         raise InputError(
@@ -246,7 +247,7 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     turn = float(np.degrees(np.arctan2(right_y - below_x, right_x + below_y)))
     turn_of_right = np.degrees(np.arctan2(right_y, right_x))
     turn_of_below = np.degrees(np.arctan2(-below_x, below_y))
-    by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / (2 * figure.reach_px))
+    by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / side_px)
     turn_error = math.hypot(float(turn_of_right - turn_of_below) / 2, by_spots)
     # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the
     # figure is large.
@@ -337,7 +338,7 @@ def orientation(context: StepContext) -> StepOutcome:
     """Find how the screen is mounted, set the bench file's keys, and check that the figure is
     upright. Raises InputError.
     """
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
@@ -481,9 +482,11 @@ def geometry(context: StepContext) -> StepOutcome:
         f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
         f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
     )
+    # from an rms over two axes
+    rms_error_arcsec = chosen.rms_arcsec / math.sqrt(4 * len(calibrated.data))
     number = StepNumber(
         chosen.rms_arcsec,
-        chosen.rms_arcsec / math.sqrt(4 * len(calibrated.data)),
+        rms_error_arcsec,
         "arcsec",
         "rms distance of held-out dots from where the fit has them",
     )

@@ -198,8 +198,9 @@ def monitor_area(
     width, height = geometry.monitor.resolution_px
     middle_x = _middles(corner_x)
     middle_y = _middles(corner_y)
-    on_screen = np.abs(middle_x - (width - 1) / 2) <= width / 2
-    on_screen &= np.abs(middle_y - (height - 1) / 2) <= height / 2
+    from_middle_x = np.abs(middle_x - (width - 1) / 2)
+    from_middle_y = np.abs(middle_y - (height - 1) / 2)
+    on_screen = (from_middle_x <= width / 2) & (from_middle_y <= height / 2)
     area = area[on_screen]
     if even is not None:
         # A black screen glows over the whole part, whose edges are darker than the dots' square.
@@ -366,8 +367,8 @@ class Look(NamedTuple):
 class PixelScatter:
     """The noise of sums over the field, from images of one pattern that were taken again.
 
-    By exposure: the variance of a black image's sum, DN^2. `dn_per_e` is that of a lit one over it,
-    for each DN of light.
+    The variance of a black image's sum, DN^2, is known for each exposure; light adds `dn_per_e` to
+    it for each DN of its sum. `default_dn_per_e` stands in where no lit pattern was repeated.
     """
 
     default_dn_per_e: float
@@ -412,8 +413,8 @@ class PixelScatter:
 
     @property
     def dn_per_e(self) -> float:
-        """The variance of light over light, DN: by the images of lit patterns; as the detector is
-        stated without repeats.
+        """DN an electron, as the variance of light over the light: by repeated images of lit
+        patterns, and as the detector is stated where none was repeated.
         """
         variance = 0.0
         light = 0.0
@@ -448,8 +449,8 @@ class _Reading(NamedTuple):
 
 
 class _Values(NamedTuple):
-    """Of each patch (n,): light above black and its own standard error, DN/s; light for a DN of a
-    lit patch's sum.
+    """Light of each patch above black (n,) and its own standard error (n,), DN/s, and what one DN
+    of a lit patch's sum is in DN/s (n,).
     """
 
     light: FloatArray
@@ -499,7 +500,7 @@ class Photometer:
         for period in self.periods:
             self.profiles[period] = lattice_profile(period, self.ratio, sigma_px)
         self.exposure_s = context.exposure_s
-        self.scatter = PixelScatter(1 / context.file.config.tracker.detector.gain_e_per_dn)
+        self.scatter = PixelScatter(1 / context.detector.gain_e_per_dn)
         self._dark_screen = context.take(self._black_screen(0))
         self.images = [self._dark_screen]
         self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
@@ -548,7 +549,8 @@ class Photometer:
         """Choose an exposure in which white does not saturate, first the bench file's; returns a
         white dot's peak, DN.
         """
-        brightest = max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1]))
+        assumed = self.assumed.light
+        brightest = max(assumed, key=lambda name: float(assumed[name][-1]))
         white = Patch(self.context.white, brightest)
         sparsest = Range(self.periods[-1])
         for probe in range(MAX_PROBES):
@@ -573,7 +575,7 @@ class Photometer:
             self.exposure_s *= FILL / fill
         dark = self._part(self._take("black", Range(1), BLACK))
         bright = self._part(self._take("white", sparsest, white))
-        share = float(self.assumed.light[white.channel][white.code])
+        share = float(assumed[white.channel][white.code])
         above_dn = (bright - dark)[self._cold]
         return float(above_dn.max(initial=1.0)) / share
 
@@ -610,8 +612,8 @@ class Photometer:
         planned: list[Patch],
         chosen: dict[Patch, Range],
     ) -> tuple[dict[int, FloatArray], dict[int, float]]:
-        """The sums of black images, in turn, by how many times longer they are exposed; those of
-        lit ones by their order.
+        """Sums over the field, DN: of the black images, in turn (images,), by how many times longer
+        they are exposed, and of each lit patch by its place in the plan.
         """
         longer = sorted({at.times for at in chosen.values()} | {1})
         blacks: dict[int, list[float]] = {times: [] for times in longer}
@@ -706,7 +708,7 @@ class Photometer:
         blacks: FloatArray,
         factors: dict[tuple[str, Range], float],
     ) -> _Values:
-        """Light above black of each patch, and the standard error of its own images."""
+        """Light of each patch above black, DN/s, and the standard error by its own images."""
         count = len(planned)
         light = np.zeros(count)
         per_dn = np.zeros(count)
@@ -728,7 +730,7 @@ class Photometer:
         return _Values(light, sigma, per_dn)
 
     def _dots(self, at: Range) -> int:
-        """By how many lit pixels and exposures a sum in a range has to be divided."""
+        """Lit pixels times exposures of a range: what a sum is divided by for a pixel's light."""
         return self.field.lit(at.period) * at.times
 
     def _link(self, pair: _Pair) -> LatticeRatio:
@@ -745,13 +747,14 @@ class Photometer:
         else:
             variance += dark_more / more**2 + dark_less / less**2
         ratio = float(np.mean(pair.ratios))
+        error = ratio * math.sqrt(variance / len(pair.ratios))
         return LatticeRatio(
             patch=pair.patch,
             dense=pair.more.period,
             sparse=pair.less.period,
             ratio=ratio,
             pairs=pair.ratios,
-            error=ratio * math.sqrt(variance / len(pair.ratios)),
+            error=error,
             times=(pair.more.times, pair.less.times),
         )
 
@@ -843,7 +846,7 @@ class Photometer:
 
     def _cut_dn(self, at: Range, light_dn: float) -> float:
         """The DN that the cut at code 0 adds to the sum of a lattice's image above black."""
-        detector = self.context.file.config.tracker.detector
+        detector = self.context.detector
         pixels = self.field.tracker_px
         stated_dn = detector.electronics_e / detector.gain_e_per_dn
         read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / pixels, math.inf)
@@ -868,8 +871,8 @@ class Photometer:
         """The noise of a pixel before the ADC, DN, by the variance of the field's sum and that
         sum.
         """
-        detector = self.context.file.config.tracker.detector
-        detector = self.context.file.config.tracker.detector
+        detector = self.context.detector
+        detector = self.context.detector
         pixels = self.field.tracker_px
         # How far a level is above the offset, rounding tells to half a step.
         light_dn = max(sum_dn / pixels - detector.offset_dn - HALF_STEP_DN, 0.0)

@@ -58,7 +58,7 @@ DIM_LIGHT = 1e-3  # relative to white: how far down responses are compared
 
 def photometry(context: StepContext) -> StepOutcome:
     """Measure the response and name its file in the bench file. Raises InputError."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     if not context.patches:
         how = (
             "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar"
@@ -196,19 +196,24 @@ def _response_figures(
     ratios = [f"{link.ratio:.4f}" for link in readings.links]
     links_mag = [abs(float(magnitude(link.ratio))) for link in readings.links]
     links_sigmas = [link.sigmas for link in readings.links]
+    off_rms_mag = float(np.sqrt((off_mag**2).mean()))
+    off_max_mag = float(np.abs(off_mag).max())
+    held_out_rms_mag = max(holdout["rms_mag"] for holdout in holdouts)
+    held_out_max_mag = max(holdout["max_mag"] for holdout in holdouts)
+    held_out_sigmas = max(holdout["p95_sigmas"] for holdout in holdouts)
     figures: dict[str, Figure] = {
         "gamma": exponent(now),
         "gamma_in_bench_file": exponent(before),
-        "bench_file_off_rms_mag": float(np.sqrt((off_mag**2).mean())),
-        "bench_file_off_max_mag": float(np.abs(off_mag).max()),
+        "bench_file_off_rms_mag": off_rms_mag,
+        "bench_file_off_max_mag": off_max_mag,
         "black_level": now.black,
         "black_level_error": black_error,
         "black_level_in_bench_file": before.black,
         "black_level_measured": black_measured,
-        "held_out_rms_mag": max(holdout["rms_mag"] for holdout in holdouts),
+        "held_out_rms_mag": held_out_rms_mag,
         "held_out_p95_mag": MAG_PER_RELATIVE * p95_percent / 100,
-        "held_out_p95_sigmas": max(holdout["p95_sigmas"] for holdout in holdouts),
-        "held_out_max_mag": max(holdout["max_mag"] for holdout in holdouts),
+        "held_out_p95_sigmas": held_out_sigmas,
+        "held_out_max_mag": held_out_max_mag,
         "noise_percent": 100 * found["noise_relative"],
         "drift_percent": drift_percent,
         "patches": len(readings.patches),
@@ -244,7 +249,7 @@ def _judged(
     limits of [verify].
     """
     limit_mag = context.file.config.verify.flux_mag
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     is_black_measured = figures["black_level_measured"] == "yes"
     black = f"black {figures['black_level']:.2e} of white as the bench file has it, not measured"
     if is_black_measured:
@@ -292,8 +297,10 @@ def response_error_mag(assumed: Response, true: Response) -> FloatArray:
     """How much fainter each code is than assumed (n,), magnitudes, from three decades below
     white to white.
     """
-    is_bright = true.light[1:] >= DIM_LIGHT
-    return np.asarray(magnitude(true.light[1:][is_bright] / assumed.light[1:][is_bright]))
+    true_light = true.light[1:]
+    is_bright = true_light >= DIM_LIGHT
+    ratio = true_light[is_bright] / assumed.light[1:][is_bright]
+    return np.asarray(magnitude(ratio))
 
 
 def exponent(response: Response) -> float:

@@ -89,7 +89,7 @@ class StarSpot:
             drawn_px = ratio * math.sqrt(sprite_px**2 + squares_px2)
             sigmas_px.append(math.hypot(psf_scale * psf_width_px, drawn_px))
         x_px, y_px = sigmas_px
-        detector = context.file.config.tracker.detector
+        detector = context.detector
         electronics_dn = detector.electronics_e / detector.gain_e_per_dn
         return cls((x_px, y_px), detector.gain_e_per_dn, detector.prnu, electronics_dn)
 
@@ -168,10 +168,10 @@ class StarSpot:
         return np.interp(dn, points_dn, noise_mag, left=np.inf)
 
     def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
-        """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
+        """What the ADC's rounding adds to the windows of stars of `dn` (n,) in all, DN: (n,
+        STEP_PHASES), by where the dark level lies between two codes (see `rounded_light`).
 
-        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's,
-        in the mean of the frames.
+        `noise_dn` is that of a pixel above its dark frame, in the mean of the frames.
         """
         shares, _ = self._shares
         pixel_shares = shares.ravel()
@@ -293,11 +293,14 @@ class StarsSeen:
         centred_mag = centred_mag - np.median(centred_mag)
         error = np.sqrt(self.noise_mag[used] ** 2 + STAR_MAG**2)
         x, y = self.screen[used].T
+        log_light = np.log(self.e_per_s[used])
+        rms_mag = float(np.sqrt((centred_mag**2).mean()))
+        error_mag = float(np.sqrt((error**2).mean()))
         return Scatter(
-            rms_mag=float(np.sqrt((centred_mag**2).mean())),
-            error_mag=float(np.sqrt((error**2).mean())),
+            rms_mag=rms_mag,
+            error_mag=error_mag,
             by_place=_explained(centred_mag, x, y, x**2 + y**2),
-            by_light=_explained(centred_mag, np.log(self.e_per_s[used])),
+            by_light=_explained(centred_mag, log_light),
         )
 
 
@@ -627,15 +630,17 @@ def _compared(
     noise_mag = shared.light_noise_mag(dn, noise_dn)
     window_dn = np.maximum(dn * spot.window_share, 1e-9)
     rounded = shared.rounded_dn(dn, noise_dn) / window_dn[:, None]
+    residual_px = places_px[chosen] - wanted.place_px[matched]
     saturated = stars.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
+    noise_mag = np.where(saturated, np.inf, noise_mag)
     return StarsSeen(
         hip=wanted.hip[matched],
         place_px=wanted.place_px[matched],
-        residual_px=places_px[chosen] - wanted.place_px[matched],
+        residual_px=residual_px,
         place_noise_px=shared.place_noise_px(dn, noise_dn),
         dn=dn,
         e_per_s=wanted.e_per_s[matched],
-        noise_mag=np.where(saturated, np.inf, noise_mag),
+        noise_mag=noise_mag,
         rounding_mag=MAG_PER_RELATIVE * rounded,
         screen=wanted.screen[matched],
         codes_mag=wanted.codes_mag[matched],

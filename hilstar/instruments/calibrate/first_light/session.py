@@ -62,7 +62,7 @@ STEPS_FILE = Path(__file__).with_name("steps.toml")
 
 def latency(context: StepContext) -> StepOutcome:
     """Measure the panel's delay and set it in the bench file. Raises InputError, MachineError."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     if not monitor.photodiode_px:
         return StepOutcome(
             "skipped",
@@ -489,11 +489,9 @@ class FirstLightSession:
         figures = {} if record is None else record.figures
         refresh_hz = figures.get("refresh_hz")
         modes = str(figures.get("modes_hz", "")).split()
-        return beat_of(
-            self.file.config,
-            None if refresh_hz is None else float(refresh_hz),
-            [float(hz) for hz in modes],
-        )
+        if refresh_hz is not None:
+            refresh_hz = float(refresh_hz)
+        return beat_of(self.file.config, refresh_hz, [float(hz) for hz in modes])
 
 
 def _finite(value: Figure) -> Figure:

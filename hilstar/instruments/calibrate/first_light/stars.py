@@ -127,13 +127,15 @@ def _place_figures(context: StepContext, seen: StarsSeen) -> dict[str, Figure]:
     rms_px = float(np.sqrt((off_px**2).mean()))
     noise_px = float(np.sqrt((seen.place_noise_px**2).mean()))
     beyond = seen.beyond_px
+    focal_length_px = context.geometry().tracker.focal_length_px
+    p95_px = float(np.percentile(off_px, 95))
     return {
         "stars": len(off_px),
         "lost": seen.lost,
         "star_rms_px": rms_px,
-        "star_p95_px": float(np.percentile(off_px, 95)),
+        "star_p95_px": p95_px,
         "star_max_px": float(off_px.max()),
-        "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / context.geometry().tracker.focal_length_px,
+        "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / focal_length_px,
         "star_noise_px": math.sqrt(2) * noise_px,
         "star_beyond_noise_p95_px": P95_OF_TWO * beyond.sigma,
         "star_beyond_noise_max_px": P95_OF_TWO * beyond.high,
@@ -276,7 +278,7 @@ def _light_figures(
     """
     sure = seen.sure
     asked_e = seen.e_per_s[sure] * context.exposure_s
-    seen_e = seen.dn[sure] * context.file.config.tracker.detector.gain_e_per_dn
+    seen_e = seen.dn[sure] * context.detector.gain_e_per_dn
     off_mag = np.asarray(magnitude(seen_e / asked_e))
     noise_mag = seen.noise_mag[sure]
     zero_point_mag = float(np.median(off_mag))
@@ -290,9 +292,10 @@ def _light_figures(
     draw_light(picture, seen.e_per_s[sure], off_mag, noise_mag, finding, from_middle)
     scatter = seen.scatter(off_mag, sure)
     beyond = Beyond.of(off_mag - zero_point_mag, noise_mag)
+    rms_mag = float(np.sqrt((spread_mag**2).mean()))
     figures: dict[str, Figure] = {
         "flux_stars": len(off_mag),
-        "flux_rms_mag": float(np.sqrt((spread_mag**2).mean())),
+        "flux_rms_mag": rms_mag,
         "flux_p95_mag": p95_mag,
         "flux_max_mag": float(spread_mag.max()),
         "flux_beyond_noise_p95_mag": P95_OF_ONE * beyond.sigma,
@@ -383,7 +386,7 @@ def scale(context: StepContext) -> StepOutcome:
         )
     asked = stars_seen.e_per_s[used]
     noise_mag = stars_seen.noise_mag[used]
-    seen_e = stars_seen.dn[used] * context.file.config.tracker.detector.gain_e_per_dn
+    seen_e = stars_seen.dn[used] * context.detector.gain_e_per_dn
     ratios = seen_e / (asked * context.exposure_s)
     ratios_mag = np.asarray(magnitude(ratios))
     star_scale = scale_of(white, ratios, noise_mag)

@@ -193,7 +193,7 @@ def _write_map(
     """Write the bench's calibration with this map, or with none where light is even; the files,
     and the bench file's key that names them.
     """
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     grid = None
     if not light_map.is_even:
         grid = light_map.grid
@@ -385,10 +385,12 @@ def _in_words(light_map: UniformityMap, is_known_uneven: bool) -> str:
 def _figures(
     context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap
 ) -> dict[str, Figure]:
+    wild_dots = int((~found.used).sum())
+    rows, columns = found.grid.shape
     figures: dict[str, Figure] = {
         "dots": len(dots.light),
-        "wild_dots": int((~found.used).sum()),
-        "grid": " x ".join(map(str, found.grid.shape)),
+        "wild_dots": wild_dots,
+        "grid": f"{rows} x {columns}",
         "darkest_of_brightest": found.darkest_of_brightest,
         "change_rms_mag": found.rms_mag,
         "off_bench_file_rms_mag": against.rms_mag,
@@ -470,7 +472,7 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     if lit.sum() < MIN_DOTS:
         few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
         raise InputError(f"{few}; look at the geometry and the focus")
-    detector = context.file.config.tracker.detector
+    detector = context.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
     # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's
@@ -565,32 +567,35 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     maps = _Maps.of(dots, light, resolution_px)
     used = maps.used
     squares = maps.held_out_squares()
-    best = min(squares, key=lambda square: float(square[used].mean()))
+    best = min(squares, key=lambda of_map: float(of_map.mean()))
     # the coarsest grid that the best one does not surely beat
     place = 0
-    while _is_surely_larger(squares[place][used], best[used]):
+    while _is_surely_larger(squares[place], best):
         place += 1
-    grid = _fitted(maps.relative[used], maps.designs[place][used], maps.shapes[place])
-    square = float(squares[place][used].mean())
+    design = maps.designs[place]
+    shape = maps.shapes[place]
+    grid = _fitted(maps.relative[used], design[used], shape)
+    square = float(squares[place].mean())
     count = int(used.sum())
-    error = float(squares[place][used].std()) / math.sqrt(count)
+    error = float(squares[place].std()) / math.sqrt(count)
     freedom = maps.freedom(place)
     missed = 0.0
     finer = range(place + 1, len(maps.shapes))
     if finer:
-        nearest = min(finer, key=lambda k: float(squares[k][used].mean()))
-        gain = (squares[place] - squares[nearest])[used]
+        nearest = min(finer, key=lambda k: float(squares[k].mean()))
+        gain = squares[place] - squares[nearest]
         # A finer map errs more by its fields' own noise, which hides as much of what it shows.
         noise = square * (maps.freedom(nearest) - freedom) / count
         gain_error = float(gain.std()) / math.sqrt(count)
         missed = _not_negative(float(gain.mean()) + noise, gain_error)
+    fit_variance = square * freedom / count
     return UniformityMap(
-        grid.reshape(maps.shapes[place]),
-        maps.designs[place] @ grid,
+        grid.reshape(shape),
+        design @ grid,
         left_mag=MAG_PER_RELATIVE * math.sqrt(square),
         left_error_mag2=MAG_PER_RELATIVE**2 * error,
         used=used,
-        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedom / count),
+        fit_mag=MAG_PER_RELATIVE * math.sqrt(fit_variance),
         missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
     )
 
@@ -640,11 +645,12 @@ class _Maps:
         return cls(shapes, designs, relative, used)
 
     def held_out_squares(self) -> list[FloatArray]:
-        """Squared relative errors of each dot (n,) in each map made without it."""
+        """Squared relative errors of the used dots in each map made without them."""
         fold = np.random.default_rng(SEED).integers(0, FOLDS, len(self.relative))
         squares = []
         for shape, design in zip(self.shapes, self.designs, strict=True):
-            squares.append(_held_out(self.relative, design, shape, self.used, fold))
+            of_map = _held_out(self.relative, design, shape, self.used, fold)
+            squares.append(of_map[self.used])
         return squares
 
     def freedom(self, place: int) -> float:

@@ -265,7 +265,8 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     is_seen = seen.shows(*places.T)
     inside = places[:tried][is_seen[:tried]]
     turns = 2 * np.pi * (np.arange(BORDER_DIRECTIONS) + 0.5) / BORDER_DIRECTIONS
-    directions = np.column_stack([np.cos(turns), np.sin(turns)]) / np.maximum(size, 1.0)
+    circle = np.column_stack([np.cos(turns), np.sin(turns)])
+    directions = circle / np.maximum(size, 1.0)
     seen_places = places[is_seen]
     outermost = seen_places[(seen_places @ directions.T).argmax(axis=0)]
     chosen = np.unique(outermost, axis=0)[:count]

@@ -90,7 +90,8 @@ class Model:
     @property
     def size(self) -> int:
         """How many numbers the model has."""
-        return len(self.names) + len(self.tracker_names) + 3 * (self.poses - 1)
+        lens_numbers = len(self.names) + len(self.tracker_names)
+        return lens_numbers + 3 * (self.poses - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +146,7 @@ def geometry_of(
 
 
 def _tracker_lens(names: tuple[str, ...], numbers: FloatArray) -> Lens:
-    """The tracker's own lens by its parameters' numbers, which others may follow."""
+    """The tracker's own lens by the numbers of its parameters; further ones are not read."""
     values = {}
     for name, number in zip(names, numbers, strict=False):
         values[name] = TRACKER_STEPS[name] * float(number)
@@ -167,7 +168,7 @@ def directions_in_cam(
 class MatchedDots:
     """Centroids (n,) and the number of each one's dot (n,)."""
 
-    seen: Observed
+    centroids: Observed
     dot: IntArray
 
     def __len__(self) -> int:
@@ -175,7 +176,7 @@ class MatchedDots:
 
     def at(self, chosen: IntArray) -> "MatchedDots":
         """The matches at indices `chosen`."""
-        return MatchedDots(self.seen.at(chosen), self.dot[chosen])
+        return MatchedDots(self.centroids.at(chosen), self.dot[chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,10 +253,10 @@ class _Loss:
         lens_numbers = numbers[: self.model.size]
         first_pose = len(self.model.names) + len(self.model.tracker_names)
         poses = (len(lens_numbers) - first_pose) // 3
-        seen_dots = self.data.seen
+        centroids = self.data.centroids
         bare = self._varied(lens_numbers)
         # the same for all terms of the monitor's camera
-        directions = directions_in_cam(bare, seen_dots.pose, seen_dots.x_px, seen_dots.y_px)
+        directions = directions_in_cam(bare, centroids.pose, centroids.x_px, centroids.y_px)
         base = off
         if self.field_degree:
             base = self._off(bare, directions)
@@ -269,7 +270,7 @@ class _Loss:
             slopes.append((trial - base) / DIFFERENCE)
         slope = np.stack(slopes, axis=1)
         pose_of_number = np.repeat(np.arange(1, poses + 1), 3)
-        is_its = np.tile(seen_dots.pose, 2)[:, None] == pose_of_number
+        is_its = np.tile(centroids.pose, 2)[:, None] == pose_of_number
         pose_slopes = np.where(is_its, np.tile(slope[:, first_pose:], poses), 0.0)
         columns = np.hstack([slope[:, :first_pose], pose_slopes])
         if not self.field_degree:
@@ -277,7 +278,7 @@ class _Loss:
         x_px, y_px = _places_px(bare, self.data, directions)
         terms = field_terms(x_px, y_px, bare.monitor.resolution_px, self.field_degree)
         terms = np.nan_to_num(terms)
-        sigma_px = self.problem.monitor_px_per_px * seen_dots.sigma_px * self.problem.noise_px
+        sigma_px = self.problem.monitor_px_per_px * centroids.sigma_px * self.problem.noise_px
         terms /= sigma_px[:, None]
         return np.hstack([columns, _blocks(terms)])
 
@@ -303,7 +304,7 @@ class _Loss:
         return weight**2
 
     def value(self, off: FloatArray, numbers: FloatArray) -> float:
-        """The loss by its residuals and numbers."""
+        """The loss: Huber's of the residuals, and the prior of the numbers."""
         size = np.abs(off)
         losses = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
         prior_loss = 0.5 * self.prior(len(numbers)) @ numbers**2
@@ -383,7 +384,7 @@ def residuals_sigma(
     problem: Problem, geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None
 ) -> FloatArray:
     """The residuals (2 n,), x then y, each in its own sigma."""
-    sigma = data.seen.sigma_px * problem.noise_px
+    sigma = data.centroids.sigma_px * problem.noise_px
     dx_px, dy_px = residuals_px(problem, geometry, data, directions)
     return np.concatenate([dx_px / sigma, dy_px / sigma])
 
@@ -393,7 +394,7 @@ def _places_px(
 ) -> tuple[FloatArray, FloatArray]:
     """Places of the centroids (n,) on the monitor by a geometry, px."""
     if directions is None:
-        centroids = data.seen
+        centroids = data.centroids
         directions = directions_in_cam(geometry, centroids.pose, centroids.x_px, centroids.y_px)
     return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
 
@@ -404,7 +405,7 @@ def noise_of_repeats(data: MatchedDots) -> float | None:
 
     It needs no model. It uses the median absolute deviation, so a few false matches do not count.
     """
-    centroids = data.seen
+    centroids = data.centroids
     dots = int(data.dot.max(initial=0)) + 1
     key = centroids.pose * dots + data.dot
     order = np.argsort(key, kind="stable")
@@ -579,7 +580,8 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     map_x_px, map_y_px = _grid_px(fit.geometry.monitor.resolution_px, MAP_PLACES)
     map_places = np.stack(_slopes_of_places(problem, fit, map_x_px, map_y_px))
     slopes = map_places @ root * to_arcsec
-    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
+    columns, rows = MAP_PLACES
+    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(rows, columns)
     # a place that was not seen has those of its neighbour
     slopes = slopes[:, _nearest_true(is_visible).ravel()]
     variance = (slopes**2).sum(axis=(0, 2)).reshape(is_visible.shape)
@@ -715,7 +717,7 @@ def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> Float
     y_px = problem.plan.y_px[data.dot]
     resolution_px = problem.nominal.monitor.resolution_px
     terms = field_terms(x_px, y_px, resolution_px, fit.field_degree)
-    sigma_px = problem.monitor_px_per_px * data.seen.sigma_px * problem.noise_px
+    sigma_px = problem.monitor_px_per_px * data.centroids.sigma_px * problem.noise_px
     return np.hstack([slopes, _blocks(terms / sigma_px[:, None])])
 
 

@@ -73,8 +73,8 @@ ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the scr
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and
-    the centroids' fate.
+    """The result of a geometric calibration: the fit and its uncertainty, the models that were
+    compared, and how many `centroids` were given.
     """
 
     problem: fits.Problem
@@ -107,7 +107,7 @@ class Calibrated:
     @property
     def measurable(self) -> list[BoolArray]:
         """For each pose, a mask of the dots (dots,) whose windows are in the tracker's image."""
-        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.seen.edge_px)
+        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.centroids.edge_px)
 
     @property
     def false(self) -> int:
@@ -404,8 +404,8 @@ class FittedParameter(NamedTuple):
 
 
 def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
-    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its
-    own lens.
+    """The figures of a calibration, by the keys of --json; `tracker` says whether its own lens was
+    "held" or "fitted".
     """
     chosen = found.chosen
     models = []
@@ -414,23 +414,29 @@ def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
     parameters = {}
     for name, parameter in parameters_of(found).items():
         parameters[name] = parameter._asdict()
+    dots = {"planned": len(found.plan), "recognised": found.recognised}
+    centroids = {
+        "given": found.centroids,
+        "matched": len(found.data),
+        "lost": found.lost,
+        "false": found.false,
+    }
+    held_out = {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec}
+    tracker_lens = "fitted"
+    if found.tracker_known:
+        tracker_lens = "held"
     return {
         "model": chosen.name,
         "poses": len(found.problem.q_poses),
-        "dots": {"planned": len(found.plan), "recognised": found.recognised},
-        "centroids": {
-            "given": found.centroids,
-            "matched": len(found.data),
-            "lost": found.lost,
-            "false": found.false,
-        },
+        "dots": dots,
+        "centroids": centroids,
         "noise_px": found.problem.noise_px,
         "noise_arcsec": found.noise_arcsec,
-        "held_out": {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec},
+        "held_out": held_out,
         "error": _both(found.uncertainty),
         "models": models,
         "parameters": parameters,
-        "tracker": "held" if found.tracker_known else "fitted",
+        "tracker": tracker_lens,
         "notes": notes_for_a_person(found),
         "written": written,
     }
@@ -443,7 +449,9 @@ def _both(error: fits.Candidate | fits.Uncertainty) -> dict[str, float]:
 def notes_for_a_person(found: Calibrated) -> tuple[str, ...]:
     """What the figures alone do not say."""
     if len(found.problem.q_poses) > 1:
-        notes = [] if found.tracker_known else [ROUND]
+        notes = []
+        if not found.tracker_known:
+            notes.append(ROUND)
     elif found.problem.nominal.tracker.lens is None:
         notes = [ONE_POSE]
     else:
@@ -464,16 +472,20 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     lens = monitor.lens or Lens()
     cx, cy = monitor.principal_point_px
     tilt_x_rad, tilt_y_rad = lens.tilt_rad
-    focal = monitor.focal_length_px
+    focal_px = monitor.focal_length_px
+    # the fit's parameter is the logarithm of the focal length
+    focal_sigma_px = focal_px * sigma.get("log_focal", 0.0)
+    tilt_x_sigma_rad = sigma.get("tilt_x", 0.0)
+    tilt_y_sigma_rad = sigma.get("tilt_y", 0.0)
     values = {
-        "focal_length_px": (focal, focal * sigma.get("log_focal", 0.0)),
+        "focal_length_px": (focal_px, focal_sigma_px),
         "principal_point_x_px": (cx, sigma.get("centre_x", 0.0)),
         "principal_point_y_px": (cy, sigma.get("centre_y", 0.0)),
         "rotation_x_arcsec": (0.0, ARCSEC_PER_RAD * sigma["rotation_x"]),
         "rotation_y_arcsec": (0.0, ARCSEC_PER_RAD * sigma["rotation_y"]),
         "rotation_z_arcsec": (0.0, ARCSEC_PER_RAD * sigma["rotation_z"]),
-        "tilt_x_deg": (math.degrees(tilt_x_rad), math.degrees(sigma.get("tilt_x", 0.0))),
-        "tilt_y_deg": (math.degrees(tilt_y_rad), math.degrees(sigma.get("tilt_y", 0.0))),
+        "tilt_x_deg": (math.degrees(tilt_x_rad), math.degrees(tilt_x_sigma_rad)),
+        "tilt_y_deg": (math.degrees(tilt_y_rad), math.degrees(tilt_y_sigma_rad)),
     }
     distortion = (*lens.radial, *lens.tangential)
     for name, value in zip(("k1", "k2", "k3", "p1", "p2"), distortion, strict=True):

@@ -397,9 +397,9 @@ def _nearest(
 
 def refuse_motion(data: MatchedDots) -> None:
     """Refuse (InputError) frames between which the whole image moved."""
-    for pose in np.unique(data.seen.pose):
-        here = data.at(np.flatnonzero(data.seen.pose == pose))
-        for axis, places in (("x", here.seen.x_px), ("y", here.seen.y_px)):
+    for pose in np.unique(data.centroids.pose):
+        here = data.at(np.flatnonzero(data.centroids.pose == pose))
+        for axis, places in (("x", here.centroids.x_px), ("y", here.centroids.y_px)):
             frames, shift, noise = frame_shifts(here, places)
             motion_px = np.ptp(shift)
             # the median of few dots scatters by itself
@@ -425,7 +425,7 @@ class FrameShifts(NamedTuple):
 
 def frame_shifts(data: MatchedDots, places: FloatArray) -> FrameShifts:
     """The shift of each frame along one axis, by Tukey's median polish over frames and dots."""
-    frames, frame = np.unique(data.seen.frame, return_inverse=True)
+    frames, frame = np.unique(data.centroids.frame, return_inverse=True)
     dots, dot = np.unique(data.dot, return_inverse=True)
     shift = np.zeros(len(frames))
     middle = np.zeros(len(dots))

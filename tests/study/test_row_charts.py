@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics import charts
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
     HIDDEN,
     ChartSpec,
     CurvePanel,
@@ -29,7 +29,7 @@ BUSY = Load(1e3)
 
 
 @dataclass(frozen=True)
-class PlantedRow:
+class Planted:
     """A row that was measured."""
 
     way: str
@@ -46,7 +46,7 @@ class Law:
     error: float
 
 
-ROWS = [PlantedRow("b", 1.0, 0.0), PlantedRow("a", 1.0, 2.0), PlantedRow("a", 10.0, np.inf)]
+ROWS = [Planted("b", 1.0, 0.0), Planted("a", 1.0, 2.0), Planted("a", 10.0, np.inf)]
 LAWS = [Law("a", 1.0, 2.5), Law("b", 1.0, 0.5)]
 
 
@@ -84,7 +84,7 @@ def test_each_series_has_a_line_of_its_rows_in_the_order_of_looks(figure, tmp_pa
 
 def test_a_measured_point_and_its_law_are_told_apart_by_their_type(figure, tmp_path):
     law = LineSpec("at", "error", of=Law)
-    dots = LineSpec("at", "error", "", marker="x", named=False, of=PlantedRow)
+    dots = LineSpec("at", "error", "", marker="x", named=False, of=Planted)
     draw_rows(tmp_path / "x", "A finding", spec_of(law, dots), [*LAWS, *ROWS[:2]])
     drawn = [(label, marker, places[0][1]) for label, _, marker, places in lines_of(figure[0])]
     assert drawn == [

@@ -53,18 +53,20 @@ Dec = Annotated[float, Meta(ge=-90, le=90)]
 Roll = Annotated[float, Meta(ge=-360, le=720)]
 # Keys of a case that are not in its bench file. Rates are those of cam with respect to icrs, in cam
 # components; `across` is about an axis in the image plane that each case draws.
-# `misalignment_arcsec` turns the display's true mounting, cam axes.
+# `misalignment_arcsec` turns the display's true mounting, cam axes. `body_deg` is from a body's
+# middle, `limb_deg` from its limb, below 0 within its disc.
 OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
-    *("time_s", "noise_seed", "scenario", "body_deg", "stray_e_per_px"),
+    *("time_s", "noise_seed", "scenario", "body_deg", "limb_deg", "stray_e_per_px"),
 )
 MAX_OWN = {
     "rate_deg_s": 360.0,
     "acceleration_deg_s2": 360.0,
     "misalignment_arcsec": 36_000.0,
     "body_deg": 180.0,
+    "limb_deg": 90.0,
     "stray_e_per_px": 1e9,
     "time_s": 9e9,
     "noise_seed": 2.0**63 - 1,
@@ -131,7 +133,8 @@ TRACKER_PSF = "tracker"
 
 class Attitudes(Table, frozen=True):
     """[attitudes]: where the cases look. `field` is a cap of `radius_deg` around `radec_deg`;
-    `log` goes along a log; `body` looks at the angle `body_deg` of the case from a `body`.
+    `log` goes along a log; `body` looks at the angle `body_deg` of the case from a `body`, or at
+    `limb_deg` from its limb.
     """
 
     kind: Literal["all-sky", "field", "log", "body"] = "all-sky"
@@ -327,6 +330,7 @@ def parse_plan(path: Path, text: str) -> Plan:
                     f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out'
                 )
             _check_range(varied, plan.sampling)
+        _check_body_angle(keys)
         _check_requires(plan)
         if plan.cases is None and plan.sampling != "grid":
             raise InputError(
@@ -364,6 +368,14 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         raise InputError(
             f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or'
             " leave it out"
+        )
+
+
+def _check_body_angle(keys: list[str]) -> None:
+    if {"body_deg", "limb_deg"} <= set(keys):
+        raise InputError(
+            '[[vary]] key = "limb_deg" and "body_deg" are one angle, from the limb and from the'
+            " middle of a body; leave one of them out"
         )
 
 

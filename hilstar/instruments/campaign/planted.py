@@ -35,8 +35,8 @@ FALSE_DN = 1000.0  # signal of a planted false star
 @dataclass(frozen=True, slots=True)
 class CaseConditions:
     """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, the angular
-    acceleration, rad/s2, cam, the detector's false stars, the angle from a body, and the end of the
-    last fault, s (None: none).
+    acceleration, rad/s2, cam, the detector's false stars, the angle from a body (`Case.body_deg`),
+    and the end of the last fault, s (None: none).
     """
 
     velocity_km_s: FloatArray

@@ -131,9 +131,8 @@ class Session:
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         velocity_km_s = np.array(tracker.config.sky.observer_velocity_km_s)
         false_stars = tracker.config.tracker.detector.false_stars
-        body_deg = float(case.values.get("body_deg", 180.0))
         conditions = CaseConditions(
-            velocity_km_s, acceleration_rad_s2, false_stars, body_deg, fault_end_s
+            velocity_km_s, acceleration_rad_s2, false_stars, case.body_deg, fault_end_s
         )
         told = "rate" in self.plan.columns
         reporter = CaseTracker(self.plan.planted, case.noise_seed, conditions, told)

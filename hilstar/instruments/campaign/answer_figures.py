@@ -44,6 +44,8 @@ MAP_DEGREE = 5  # of the polynomials of a star's place error over the detector
 WILD_SIGMAS = 6.0
 SMALL_RATE_DEG_S = 1e-6
 MAX_EXPONENT = 50.0
+SMALL_SHARE = 1e-3  # of a sum that all cases but a heavy one have
+JITTER_ROUNDS = 3  # of weights by the jitter that the last ones gave
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
@@ -154,15 +156,27 @@ def _root_mean(
     variance = float(sums.sum() / whole.sum())
     # few cases draw limits that are too narrow: by their scatter and Student's t they are wider,
     # and skew, as a variance is
-    count = len(sums)
-    if variance > 0 and count > 1:
-        scatter = float(((sums - variance * whole) ** 2).sum()) * count / (count - 1)
-        wide = float(stats.t.ppf(c, count - 1)) * math.sqrt(scatter) / float(whole.sum())
+    if variance > 0 and len(sums) > 1:
+        wide = _spread(sums, whole, c)
         high = max(high, variance * math.exp(min(wide / variance, MAX_EXPONENT)))
         low = min(low, variance - wide)
     value = math.sqrt(max(variance, 0.0))
     low, high = math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
-    return BoundedFigure(value, min(low, value), max(high, value), count, method)
+    return BoundedFigure(value, min(low, value), max(high, value), len(sums), method)
+
+
+def _spread(sums: FloatArray, whole: FloatArray, confidence: float) -> float:
+    """How far the sum of `sums` (n,) over that of `whole` (n,) may be off, by the cases' scatter.
+
+    A heavy case draws the ratio to itself, so its residual counts more (MacKinnon and White 1985,
+    HC3), and fewer cases tell the scatter (Satterthwaite).
+    """
+    share = whole / whole.sum()
+    off = (sums - whole * sums.sum() / whole.sum()) / np.maximum(1 - share, SMALL_SHARE)
+    squares = share**2
+    freedom = max(float(squares.sum() ** 2 / (squares**2).sum()) - 1, 1.0)
+    sigma = math.sqrt(float((off**2).sum())) / float(whole.sum())
+    return float(stats.t.ppf(confidence, freedom)) * sigma
 
 
 def _summed(values: FloatArray, number: IntArray) -> FloatArray:
@@ -265,10 +279,32 @@ def _jitter(
     off = residual[slews]
     parallel = (off[:, :2] * along).sum(axis=1)
     normal = off[:, 1] * along[:, 0] - off[:, 0] * along[:, 1]
-    excess = parallel**2 - normal**2
     square = (across**2).sum(axis=1)
+    excess = (parallel**2 - normal**2) / _fitted_share(square)
     method = "excess of the error along slews over that across them, bootstrap over cases"
-    return _root_mean(excess * square, square**2, case[slews], require, rng, method)
+    weights = _jitter_weights(excess, square, float((normal**2).mean()))
+    return _root_mean(excess * weights, square * weights, case[slews], require, rng, method)
+
+
+def _fitted_share(square: FloatArray) -> FloatArray:
+    """What the fit of bias and stamp has left of the excesses (n,) at squared rates (n,): of errors
+    along the slews that grow with the rate, to the first order in 1 / n.
+    """
+    share = square / square.sum()
+    return np.asarray(1 - 2 / len(square) - 2 * share + (share**2).sum())
+
+
+def _jitter_weights(excess: FloatArray, square: FloatArray, variance: float) -> FloatArray:
+    """The weights (n,) of excesses, arcsec2, at squared rates (n,): the best ones for the jitter
+    that they give themselves, beside a noise of this variance. Small against the noise, fast slews
+    tell it; large, every slew does.
+    """
+    weights = square
+    for _ in range(JITTER_ROUNDS):
+        jitter = max(float((excess * weights).sum() / (square * weights).sum()), 0.0)
+        # of Gaussian errors the variance of a square is twice that of the errors, squared
+        weights = square / ((variance + jitter * square) ** 2 + variance**2)
+    return weights
 
 
 # ---- aberration ----

@@ -157,7 +157,11 @@ def read_acceptance_plan(
     try:
         sets = _sets(plan, path.parent, bench, quick, through or plan.through)
         for number, clause in enumerate(plan.clause, start=1):
-            _check_clause(f"[[clause]] number {number}", clause, {each.name: each for each in sets})
+            _check_clause(
+                f"[[clause]] number {number}",
+                clause,
+                {case_set.name: case_set for case_set in sets},
+            )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     asked = {clause.of for clause in plan.clause}
@@ -167,7 +171,7 @@ def read_acceptance_plan(
         title=plan.title,
         seed=plan.seed,
         through=through or plan.through,
-        sets=tuple(each for each in sets if each.name in asked),
+        sets=tuple(case_set for case_set in sets if case_set.name in asked),
         clauses=tuple(plan.clause),
         untested=tuple(plan.untested),
     )
@@ -179,14 +183,14 @@ def _sets(
     sets = []
     for name, tables in plan.cases.items():
         where = f"[cases.{name}]"
-        own = _own_keys(where, name, tables)
+        set_keys = _own_keys(where, name, tables)
         campaign = {key: value for key, value in tables.items() if key not in OWN}
         campaign |= {"bench": str(bench.resolve()), "through": through}
         if "vary" in campaign:
             campaign["vary"] = [_with_files(varied, folder) for varied in campaign["vary"]]
         campaign.setdefault("seed", plan.seed)
-        if quick and own.quick_cases is not None:
-            campaign["cases"] = own.quick_cases
+        if quick and set_keys.quick_cases is not None:
+            campaign["cases"] = set_keys.quick_cases
         asked = {
             QUANTITY_COLUMNS[clause.quantity]
             for clause in plan.clause
@@ -196,10 +200,10 @@ def _sets(
             campaign["columns"] = sorted({*asked, *campaign.get("columns", [])})
         refused = ""
         if through == "bench":
-            campaign, refused = _on_bench(campaign, own.sweep)
+            campaign, refused = _on_bench(campaign, set_keys.sweep)
         elif plan.planted is not None:
             campaign["planted"] = _without_defaults(plan.planted)
-        sets.append(CaseSet(name, own.about, campaign, own.sweep, refused))
+        sets.append(CaseSet(name, set_keys.about, campaign, set_keys.sweep, refused))
     return sets
 
 
@@ -235,12 +239,12 @@ def _own_keys(where: str, name: str, tables: dict[str, Any]) -> CaseKeys:
         if key in tables:
             raise InputError(f"{where} {key}: is not of a set of cases; leave it out")
     try:
-        own = msgspec.convert({key: tables[key] for key in OWN if key in tables}, CaseKeys)
+        set_keys = msgspec.convert({key: tables[key] for key in OWN if key in tables}, CaseKeys)
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: {error}") from error
-    if own.sweep is not None:
-        own.sweep.check(f"{where} sweep")
-    return own
+    if set_keys.sweep is not None:
+        set_keys.sweep.check(f"{where} sweep")
+    return set_keys
 
 
 def _without_defaults(planted: PlantedFaults) -> dict[str, Any]:

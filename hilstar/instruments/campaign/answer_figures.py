@@ -93,12 +93,12 @@ def answer_figure(
         return _time_figure(require, cases, rng)
     if quantity == "aberration":
         return _aberration(require, cases)
-    found = StarTable.of(cases)
+    stars = StarTable.of(cases)
     figures: dict[str, Callable[[], BoundedFigure]] = {
-        "star-noise": lambda: _star_noise(require, found, resolution_px, rng),
-        "star-fov-error": lambda: _star_map(require, found, resolution_px, rng),
-        "star-colour": lambda: _star_colour(require, found),
-        "star-limit": lambda: _star_limit(require, found, rng),
+        "star-noise": lambda: _star_noise(require, stars, resolution_px, rng),
+        "star-fov-error": lambda: _star_map(require, stars, resolution_px, rng),
+        "star-colour": lambda: _star_colour(require, stars),
+        "star-limit": lambda: _star_limit(require, stars, rng),
         "false-stars": lambda: _false_stars(require, cases, rng),
     }
     return figures[quantity]()
@@ -389,13 +389,13 @@ class PlaceOffsets:
     dy_px: FloatArray
 
 
-def fitted_places(found: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
+def fitted_places(stars: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
     """The map of reported stars' place errors; wild ones do not count. Raises TooFewCases."""
-    kept = np.flatnonzero(found.found)
-    offsets = np.stack([found.dx_px, found.dy_px], axis=1)[kept]
-    terms = field_terms(found.x_px[kept], found.y_px[kept], resolution_px, MAP_DEGREE)
+    reported = np.flatnonzero(stars.found)
+    offsets = np.stack([stars.dx_px, stars.dy_px], axis=1)[reported]
+    terms = field_terms(stars.x_px[reported], stars.y_px[reported], resolution_px, MAP_DEGREE)
     needed = 4 * terms.shape[1]
-    near = np.ones(len(kept), dtype=np.bool_)
+    near = np.ones(len(reported), dtype=np.bool_)
     for _ in range(3):
         if near.sum() < needed:
             raise TooFewCases(f"{int(near.sum())} stars, and {needed} are needed for a map", 0)
@@ -406,7 +406,7 @@ def fitted_places(found: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
         close = np.abs(residual) <= WILD_SIGMAS * np.maximum(spread, 1e-9)
         near = np.asarray(close.all(axis=1), dtype=np.bool_)
     fitted = terms[near] @ solution
-    return PlaceFit(solution, found.case[kept][near], fitted, residual[near])
+    return PlaceFit(solution, stars.case[reported][near], fitted, residual[near])
 
 
 def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> PlaceOffsets:
@@ -487,13 +487,13 @@ def _star_limit(require: Require, found: StarTable, rng: np.random.Generator) ->
     shape = (cases, bins)
     index = number * bins + place - first
     lit = np.bincount(index, minlength=cases * bins).reshape(shape)
-    seen = np.bincount(index[found.found], minlength=cases * bins).reshape(shape)
+    reported = np.bincount(index[found.found], minlength=cases * bins).reshape(shape)
     middle_mag = np.asarray((np.arange(bins) + first + 0.5) * LIMIT_BIN_MAG, dtype=np.float64)
-    value = half_seen(middle_mag, seen.sum(axis=0), lit.sum(axis=0))
+    value = half_seen(middle_mag, reported.sum(axis=0), lit.sum(axis=0))
     drawn = []
     for _ in range(LIMIT_DRAWS):
         chosen = rng.integers(0, cases, cases)
-        drawn.append(half_seen(middle_mag, seen[chosen].sum(axis=0), lit[chosen].sum(axis=0)))
+        drawn.append(half_seen(middle_mag, reported[chosen].sum(axis=0), lit[chosen].sum(axis=0)))
     low, high = np.quantile(drawn, [1 - require.confidence, require.confidence])
     # a curve that is sharper than a bin is known to within one
     low = min(float(low), value) - LIMIT_BIN_MAG / 2
@@ -523,8 +523,8 @@ def half_seen(v_mag: FloatArray, seen: IntArray, lit: IntArray) -> float:
     cut = int(np.argmin(missed + beyond))
     edges = np.concatenate([v_mag - LIMIT_BIN_MAG / 2, [v_mag[-1] + LIMIT_BIN_MAG / 2]])
     start = np.array([edges[cut], math.log(0.1)])
-    found = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
-    return float(min(max(found.x[0], v_mag[0]), v_mag[-1]))
+    fitted = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
+    return float(min(max(fitted.x[0], v_mag[0]), v_mag[-1]))
 
 
 def _false_stars(require: Require, cases: Columns, rng: np.random.Generator) -> BoundedFigure:

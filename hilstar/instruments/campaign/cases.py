@@ -489,11 +489,11 @@ def columns(
 ) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
-    found: dict[str, Kind] = {}
+    kinds: dict[str, Kind] = {}
     recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
     for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
-        found[name] = varied.get(name) or columns_kind(name)
-    return found | further_columns(further)
+        kinds[name] = varied.get(name) or columns_kind(name)
+    return kinds | further_columns(further)
 
 
 def further_columns(further: tuple[Further, ...]) -> dict[str, Kind]:

@@ -134,8 +134,8 @@ class Session:
         conditions = CaseConditions(
             velocity_km_s, acceleration_rad_s2, false_stars, case.body_deg, fault_end_s
         )
-        told = "rate" in self.plan.columns
-        reporter = CaseTracker(self.plan.planted, case.noise_seed, conditions, told)
+        with_rate = "rate" in self.plan.columns
+        reporter = CaseTracker(self.plan.planted, case.noise_seed, conditions, with_rate)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, exposure_s)
             # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and

@@ -9,6 +9,8 @@ of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps dr
                the motion, and turns its sign with the slew
     jitter     along a slew the error's variance exceeds that across it by (rate x jitter)^2
     aberration error = bias + share x the turn by v / c; a share of 1 leaves it all
+    motion     error = bias + (share x years since the bench's date + age) x the turn in a year by
+               the stars' proper motion; a share of 1 leaves the stars where they are
     stars      place error = a smooth map over the detector + noise; signal against B-V; a logistic
                curve of detection against V
 """
@@ -34,9 +36,10 @@ from hilstar.instruments.campaign.cases import (
     Q,
 )
 from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
-from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
 from hilstar.instruments.campaign.planted import aberration_rad
 from hilstar.instruments.campaign.results import VARY, Columns
+from hilstar.instruments.campaign.star_motion import YEARLY_TURN, YEARS
 from hilstar.optics.camera import field_terms
 
 MIN_CASES = 8
@@ -93,6 +96,8 @@ def answer_figure(
         return _time_figure(require, cases, rng)
     if quantity == "aberration":
         return _aberration(require, cases)
+    if quantity in MOTION_QUANTITIES:
+        return _proper_motion(require, cases)
     stars = StarTable.of(cases)
     figures: dict[str, Callable[[], BoundedFigure]] = {
         "star-noise": lambda: _star_noise(require, stars, resolution_px, rng),
@@ -326,15 +331,52 @@ def _aberration(require: Require, cases: Columns) -> BoundedFigure:
     _enough(case, "attitude")
     turns = [aberration_rad(q[k], velocities[k])[:2] for k in case]
     predicted = ARCSEC_PER_RAD * np.array(turns)
-    design = np.zeros((2 * len(case), 3))
-    for k in range(2):
-        rows = slice(k * len(case), (k + 1) * len(case))
-        design[rows, k] = 1.0
-        design[rows, 2] = predicted[:, k]
-    fit = fit_by_cases(design, errors[case].T.ravel(), np.tile(case, 2))
-    sigma = math.sqrt(float(fit.covariance[2, 2]))
+    fit = _turn_fit(errors[case], predicted[:, :, None], case)
     method = "linear fit over the observer's velocity, Student's t"
-    return _size(fit.value[2:], np.array([sigma]), fit.cases, require.confidence, method)
+    return _turn_figure(fit, 0, require, method)
+
+
+def _turn_fit(errors: FloatArray, predicted: FloatArray, case: IntArray) -> CaseFit:
+    """The fit of errors (n, 2) of each case, across, by a bias of each axis and by predicted turns
+    (n, 2, k).
+    """
+    count, axes, terms = predicted.shape
+    design = np.zeros((axes * count, axes + terms))
+    for k in range(axes):
+        rows = slice(k * count, (k + 1) * count)
+        design[rows, k] = 1.0
+        design[rows, axes:] = predicted[:, k]
+    return fit_by_cases(design, errors.T.ravel(), np.tile(case, axes))
+
+
+def _turn_figure(fit: CaseFit, term: int, require: Require, method: str) -> BoundedFigure:
+    """The figure of a term of `_turn_fit`."""
+    column = 2 + term
+    sigma = math.sqrt(float(fit.covariance[column, column]))
+    value = fit.value[column : column + 1]
+    return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
+
+
+# ---- proper motion ----
+
+
+def _proper_motion(require: Require, cases: Columns) -> BoundedFigure:
+    """The share of proper motion that the attitude has not followed, or the age of the places at
+    the bench's date.
+    """
+    errors = cases.vectors("error_{}_arcsec", "xyz")[:, :2]
+    yearly = cases.vectors(YEARLY_TURN, "xy")
+    years = cases.numbers[YEARS]
+    known = np.isfinite(errors).all(axis=1) & np.isfinite(yearly).all(axis=1)
+    case = np.flatnonzero(known)
+    _enough(case, "attitude")
+    if require.quantity == "proper-motion" and not np.ptp(years[case]):
+        raise TooFewCases("cases at several dates tell it", len(case))
+    turns = np.stack([yearly[case] * years[case, None], yearly[case]], axis=2)
+    fit = _turn_fit(errors[case], turns, case)
+    term = MOTION_QUANTITIES.index(require.quantity)
+    method = "linear fit over the yearly turn of each field, Student's t"
+    return _turn_figure(fit, term, require, method)
 
 
 # ---- single stars ----

@@ -94,6 +94,8 @@ Quantity = Literal[
     "time-bias",
     "time-jitter",
     "aberration",
+    "proper-motion",
+    "catalogue-age",
     "star-noise",
     "star-fov-error",
     "star-colour",
@@ -106,6 +108,7 @@ RATE_QUANTITIES = ("rate-bias", "rate-noise", "rate-scale", "rate-lag")
 WITH_AXIS = (*AXIS_QUANTITIES, *RATE_QUANTITIES)
 TIME_QUANTITIES = ("time-to-first-attitude", "recovery")
 SHARE_QUANTITIES = ("availability", "wrong-rate", "no-attitude", "false-attitude")
+MOTION_QUANTITIES = ("proper-motion", "catalogue-age")
 STAR_QUANTITIES = ("star-noise", "star-fov-error", "star-colour", "star-limit", "false-stars")
 # These take `share`: the quantile of so many cases.
 WITH_SHARE = ("fov-error", "pixel-error", "noise", "nea", *TIME_QUANTITIES)
@@ -113,12 +116,13 @@ QUANTITY_UNITS = dict.fromkeys(AXIS_QUANTITIES, "arcsec") | dict.fromkeys(TIME_Q
 QUANTITY_UNITS |= dict.fromkeys(SHARE_QUANTITIES, "")
 QUANTITY_UNITS |= {"rate-bias": "deg/s", "rate-noise": "deg/s", "rate-scale": "", "rate-lag": "s"}
 QUANTITY_UNITS |= {"time-bias": "s", "time-jitter": "s", "aberration": ""}
+QUANTITY_UNITS |= {"proper-motion": "", "catalogue-age": "yr"}
 QUANTITY_UNITS |= {"star-noise": "px", "star-fov-error": "px", "star-colour": "mag/mag"}
 QUANTITY_UNITS |= {"star-limit": "mag", "false-stars": "a frame", "edge": ""}
 # The further columns that a quantity is found from.
 QUANTITY_COLUMNS: dict[str, Further] = {
     **dict.fromkeys(RATE_QUANTITIES, "rate"),
-    **dict.fromkeys(("time-bias", "time-jitter", "aberration"), "time"),
+    **dict.fromkeys(("time-bias", "time-jitter", "aberration", *MOTION_QUANTITIES), "time"),
     **dict.fromkeys(STAR_QUANTITIES, "stars"),
 }
 CONDITION = re.compile(
@@ -247,6 +251,8 @@ class PlantedFaults(Table, frozen=True):
     stamp_bias_s: Number = 0.0
     stamp_jitter_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     aberration: Number = 0.0
+    proper_motion: Number = 0.0
+    catalogue_age_yr: Number = 0.0
     star_noise_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
     star_fov_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
     star_colour: Number = 0.0
@@ -572,6 +578,10 @@ def changed_bench(file: BenchFile, tables: dict[str, Any], values: dict[str, Any
     if not changes:
         return file
     tables = copy.deepcopy(tables)
+    for key, other in (("epoch_utc", "epoch_jyear"), ("epoch_jyear", "epoch_utc")):
+        # a varied date stands in the place of the file's
+        if f"sky.{key}" in changes:
+            tables.get("sky", {}).pop(other, None)
     for key, value in changes.items():
         _set(tables, key.split("."), value, file.config)
     return changed_file(file, tables)

@@ -6,7 +6,7 @@ A solver that tells no rate gets that of its last two attitudes, half a step old
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,7 +36,8 @@ FALSE_DN = 1000.0  # signal of a planted false star
 class CaseConditions:
     """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, the angular
     acceleration, rad/s2, cam, the detector's false stars, the angle from a body (`Case.body_deg`),
-    and the end of the last fault, s (None: none).
+    the end of the last fault, s (None: none), and the turn (3,), rad, cam, by places of stars that
+    are old.
     """
 
     velocity_km_s: FloatArray
@@ -44,6 +45,7 @@ class CaseConditions:
     false_stars: int = 0
     body_deg: float = 180.0
     fault_end_s: float | None = None
+    old_places_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 class CaseTracker:
@@ -121,6 +123,7 @@ class CaseTracker:
         error_rad = error_rad + planted.aberration * aberration_rad(
             q, self._conditions.velocity_km_s
         )
+        error_rad = error_rad + self._conditions.old_places_rad
         return multiply(from_rotation_vector(error_rad), q)
 
     def _rate(self, rate_rad_s: FloatArray | None) -> FloatArray | None:

@@ -46,6 +46,7 @@ from hilstar.instruments.campaign.requirements import (
     verdicts_of,
 )
 from hilstar.instruments.campaign.results import VARY, Columns, read_cases
+from hilstar.instruments.campaign.star_motion import with_motion
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
@@ -106,6 +107,7 @@ def write_requirements(
         bench_arcsec = None
     else:
         bench_arcsec = certificate.attitude_arcsec
+    cases = with_motion(cases, plan.require, file, scale)
     verdicts = verdicts_of(plan.require, cases, scale, plan.seed, bench_arcsec)
     rows = []
     for verdict in verdicts:

@@ -58,6 +58,11 @@ SETS = {
         '[[cases.sun.vary]]\nkey = "sky.epoch_utc"\nvalues = ["2026-03-20T12:00:00"]\n'
         '[[cases.sun.vary]]\nkey = "sky.bodies.sun"\nvalues = [true]\n'
     ),
+    "dates": (
+        '[cases.dates]\ncases = 80\nframes = 2\n[[cases.dates.vary]]\nkey = "sky.epoch_utc"\n'
+        'values = ["1906-01-01T00:00:00", "1946-04-01T00:00:00", "2006-07-01T00:00:00",'
+        ' "2046-10-01T00:00:00"]\n'
+    ),
     "earth": (
         '[cases.earth]\ncases = 16\n[cases.earth.attitudes]\nkind = "body"\nbody = "earth"\n'
         '[cases.earth.sweep]\nkey = "limb_deg"\nstart = 45.0\nstop = -30.0\n'
@@ -91,6 +96,8 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "time-bias": ("slews", "stamp_bias_s = 0.02", 0.02, "maximum"),
     "time-jitter": ("slews", "stamp_jitter_s = 0.02", 0.02, "maximum"),
     "aberration": ("aberration", "aberration = 1.0", 1.0, "maximum"),
+    "proper-motion": ("dates", "proper_motion = 1.0", 1.0, "maximum"),
+    "catalogue-age": ("dates", "catalogue_age_yr = 100.0", 100.0, "maximum"),
     "star-noise": ("stars", "star_noise_px = 0.3", 0.3, "maximum"),
     "star-fov-error": ("stars", "star_fov_px = 0.3", 0.3, "maximum"),
     "star-colour": ("stars", "star_colour = 0.1", 0.1, "maximum"),

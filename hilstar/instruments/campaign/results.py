@@ -60,6 +60,10 @@ WORDS = {
     "unanswered": "answers that are missing or wrong",
 }
 MAX_REASONS = 5
+SENSITIVITY_COLUMNS = (
+    *("measure", "unit", "parameter", "overall", "cost", "share", "sure"),
+    *("best", "at_best", "worst", "at_worst"),
+)
 
 
 @dataclass(frozen=True)
@@ -80,15 +84,14 @@ class Columns:
 
     def some(self, chosen: npt.NDArray[np.bool_]) -> "Columns":
         """The chosen (n,) cases alone."""
+        rows = np.flatnonzero(chosen).tolist()
         numbers = {name: column[chosen] for name, column in self.numbers.items()}
-        texts = {
-            name: [text for text, is_one in zip(column, chosen, strict=True) if is_one]
-            for name, column in self.texts.items()
-        }
-        lists = {
-            name: [values for values, is_one in zip(column, chosen, strict=True) if is_one]
-            for name, column in self.lists.items()
-        }
+        texts: dict[str, list[str]] = {}
+        for name, column_texts in self.texts.items():
+            texts[name] = [column_texts[row] for row in rows]
+        lists: dict[str, list[FloatArray]] = {}
+        for name, values in self.lists.items():
+            lists[name] = [values[row] for row in rows]
         return Columns(self.cases, numbers, texts, lists)
 
     def vectors(self, form: str, names: str) -> FloatArray:
@@ -115,14 +118,11 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
                 if pa.types.is_string(column.type):
                     texts.setdefault(name, []).extend(value or "" for value in column.to_pylist())
                 elif pa.types.is_list(column.type):
-                    lists.setdefault(name, []).extend(
-                        np.array(values or [], dtype=np.float64) for values in column.to_pylist()
-                    )
+                    for values in column.to_pylist():
+                        row = np.array(values or [], dtype=np.float64)
+                        lists.setdefault(name, []).append(row)
                 else:
-                    values = np.array(
-                        [np.nan if v is None else float(v) for v in column.to_pylist()]
-                    )
-                    numbers.setdefault(name, []).append(values)
+                    numbers.setdefault(name, []).append(_floats(column.to_pylist()))
         return Columns(
             file.metadata.num_rows,
             {name: np.concatenate(parts) for name, parts in numbers.items()},
@@ -134,6 +134,15 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
             f"{path}: is no table of a campaign ({error}); delete it, and run the same command"
             " again"
         ) from error
+
+
+def _floats(values: list[Any]) -> FloatArray:
+    """Numbers (n,), NaN for None."""
+    numbers = np.full(len(values), np.nan)
+    for row, value in enumerate(values):
+        if value is not None:
+            numbers[row] = value
+    return numbers
 
 
 def case_budget(
@@ -463,6 +472,15 @@ def _level_text(cost: Cost, place: int) -> str:
     return f"{_figure(float(cost.level[place]), cost)} at {where}"
 
 
+def _sensitivity_row(cost: Cost) -> tuple[Any, ...]:
+    """A row of sensitivity.csv."""
+    sure = str(cost.sure).lower()
+    best, worst = cost.best, cost.worst
+    at_best, at_worst = float(cost.level[best]), float(cost.level[worst])
+    about = (cost.measure, cost.unit, cost.parameter, cost.overall, cost.cost, cost.share, sure)
+    return (*about, cost.places[best], at_best, cost.places[worst], at_worst)
+
+
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     """Write `budget.csv`, `sensitivity.csv`, a chart for each measure that varies, and the page
     `campaign.html`; the JSON object of `hilstar campaign`.
@@ -475,41 +493,8 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     budget_table = list(budget_rows(budget, parts))
     write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_table)
     varied_costs = costs(cases)
-    names = (
-        "measure",
-        "unit",
-        "parameter",
-        "overall",
-        "cost",
-        "share",
-        "sure",
-        "best",
-        "at_best",
-        "worst",
-        "at_worst",
-    )
-    rows = []
-    for varied_cost in varied_costs:
-        rows.append(
-            (
-                *(
-                    varied_cost.measure,
-                    varied_cost.unit,
-                    varied_cost.parameter,
-                    varied_cost.overall,
-                    varied_cost.cost,
-                    varied_cost.share,
-                    str(varied_cost.sure).lower(),
-                ),
-                *(
-                    varied_cost.places[varied_cost.best],
-                    float(varied_cost.level[varied_cost.best]),
-                    varied_cost.places[varied_cost.worst],
-                    float(varied_cost.level[varied_cost.worst]),
-                ),
-            )
-        )
-    write_csv(table.with_name("sensitivity.csv"), names, rows)
+    rows = [_sensitivity_row(varied_cost) for varied_cost in varied_costs]
+    write_csv(table.with_name("sensitivity.csv"), SENSITIVITY_COLUMNS, rows)
     findings = []
     measure_costs = {}
     for measure in dict.fromkeys(cost.measure for cost in varied_costs):
@@ -556,12 +541,12 @@ def lines_of(summary: dict[str, Any]) -> list[str]:
                     for axis, value in asdict(axes).items()
                 )
                 lines.append(f"{name:20}{', '.join(values)}")
-    found = summary["centroids"]
-    if found is not None:
-        lines.append(
-            f"{'centroids':20}{found['sigma_x_px']:.3g}, {found['sigma_y_px']:.3g} px one sigma,"
-            f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g}"
-            " false a frame"
-        )
+    centroids = summary["centroids"]
+    if centroids is not None:
+        sigma_x_px, sigma_y_px = centroids["sigma_x_px"], centroids["sigma_y_px"]
+        share = f"{100 * centroids['found_share']:.3g} % of stars found"
+        false = f"{centroids['false_a_frame']:.3g} false a frame"
+        sigma = f"{sigma_x_px:.3g}, {sigma_y_px:.3g} px one sigma"
+        lines.append(f"{'centroids':20}{sigma}, {share}, {false}")
     lines.append(f"{'limit of its stars':20}{limit_text(summary['limit_arcsec'])}")
     return [*lines, *summary["notes"], *summary["findings"]]

@@ -267,8 +267,8 @@ class _Noise:
         is_bright = codes > codes[len(codes) // 3]
         dof = squares = 0.0
         for of in noisy:
-            relative_squares = of.squares / of.mean**2
-            squares += float(relative_squares[is_bright].sum())
+            relative_squares = of.squares[is_bright] / of.mean[is_bright] ** 2
+            squares += float(relative_squares.sum())
             dof += float(of.freedom[is_bright].sum())
         relative = 0.0
         if dof:

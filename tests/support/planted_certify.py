@@ -6,17 +6,18 @@ from __future__ import annotations
 
 import datetime
 from collections import defaultdict
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
-from hilstar.instruments.certify import assembly, certificate
+from hilstar.instruments.certify import assembly, certificate, structure
 from hilstar.instruments.certify.budget import BATCH
 from hilstar.instruments.certify.readings import ImageReader
 from hilstar.server.bench.bench_file import read_bench_file
@@ -33,7 +34,7 @@ from tests.support.planted_readings import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Collection
 
     from hilstar.server.bench.certificate_file import Certificate
 
@@ -201,14 +202,32 @@ def stated_directions() -> str:
     return f"[certify.tracker]\nname = 'planted'\n{expanded}\n"
 
 
+After = Callable[[int, dict[tuple[str, str], Counted]], None]
+
+# What a part of a certificate is read by; the figures that it tells.
+LIGHT, PLACE, DELAY = "light", "place", "delay"
+PARTS = {
+    LIGHT: QUANTITIES[:1],
+    PLACE: QUANTITIES[1:6],
+    DELAY: QUANTITIES[6:],
+}
+
+
 def coverage(
     draw: Callable[[np.random.Generator], Truth],
     benches: int,
     seed: int,
     keys: str = "",
     tables: str = EXACT_LENS,
+    parts: tuple[str, ...] = (LIGHT, PLACE, DELAY),
+    after: After | None = None,
 ) -> dict[tuple[str, str], Counted]:
-    """Certify planted benches of a kind by their readings and count, by quantity and region."""
+    """Certify planted benches of a kind by their readings and count, by quantity and region.
+
+    `after` gets the number of benches and the counts after each.
+    Of `parts` alone each bench's fits are made and its figures are counted: the others are the
+    first bench's, which no figure of `parts` goes by.
+    """
     found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         path = Path(folder) / "bench.toml"
@@ -217,23 +236,63 @@ def coverage(
         )
         path.write_text(f"{bench}[certify]\nfields = 1\n{keys}{tables}")
         file = read_bench_file(path)
-        # Every bench file is the same, so that its stars are; one batch of trials knows an end
-        # within 2 % of the half width.
-        stars = assembly.reference_stars(file)
-        patch.setattr(assembly, "reference_stars", lambda file: stars)
+        # Every bench file is the same, so that its stars are, and what the sky adds to them; one
+        # batch of trials knows an end within 2 % of the half width.
+        for name in ("reference_stars", "of_sky"):
+            patch.setattr(assembly, name, _once(getattr(assembly, name)))
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
+        # A certificate takes its first check, which is in no figure of it.
+        patch.setattr(certificate, "take_check", lambda file, reader: None)
+        patch.setattr(structure, "_diagonal_in_time", _for_each(structure._diagonal_in_time))
+        if LIGHT not in parts:
+            patch.setattr(assembly, "light_deviation", _once(assembly.light_deviation))
+            patch.setattr(assembly, "evenness", _once(assembly.evenness))
+        if PLACE not in parts:
+            patch.setattr(assembly, "lens_fit", _once(assembly.lens_fit))
+        stars = assembly.reference_stars(file)
+        counted = [quantity for part in parts for quantity in PARTS[part]]
         for number in range(benches):
             rng = np.random.default_rng((seed, number))
             one = draw(rng)
             certified, _ = certificate.certify(file, PlantedReader(one, rng), NOW, quick=True)
-            count(certified, true_figures(one, stars), found)
+            count(certified, true_figures(one, stars), found, counted)
+            if after is not None:
+                after(number + 1, found)
     return dict(found)
+
+
+def _for_each(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of moments and a length that keeps its results: all benches have the same."""
+    results: dict[tuple[bytes, float], Any] = {}
+
+    def kept(t: np.ndarray, length: float) -> Any:
+        key = t.tobytes(), length
+        if key not in results:
+            results[key] = function(t, length)
+        return results[key]
+
+    return kept
+
+
+def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that gives its first result again, whatever it is asked."""
+    results: list[Any] = []
+
+    def first(*arguments: object) -> object:
+        if not results:
+            result = function(*arguments)
+            results.append(result if not isinstance(result, Iterator) else list(result))
+        return results[0]
+
+    return first
 
 
 DETECTOR = "[tracker.detector]\nread_noise_e = 15\n"
 
 
-def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted]:
+def coverage_by_images(
+    benches: int, seed: int, after: After | None = None
+) -> dict[tuple[str, str], Counted]:
     """The same by images of the tracker, each drawn: the truth is a file, and hilstar's own twin
     draws it.
     """
@@ -260,6 +319,8 @@ def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted
                     )
             figures = [each for each in certified.figures if each.truth is not None]
             count(certified, {(each.quantity, each.star): each.truth for each in figures}, found)
+            if after is not None:
+                after(number + 1, found)
     return dict(found)
 
 
@@ -267,16 +328,18 @@ def count(
     certified: Certificate,
     truth: dict[tuple[str, int | None], float],
     found: dict[tuple[str, str], Counted],
+    quantities: Collection[str] = QUANTITIES,
 ) -> None:
-    """Add one certificate to the counts."""
-    stated = [each for each in certified.figures if each.quantity in QUANTITIES]
+    """Add one certificate's figures of some quantities to the counts."""
+    stated = [each for each in certified.figures if each.quantity in quantities]
     for each in stated:
         region = "field" if each.region.startswith("field") else each.region
         one, true = found[each.quantity, region], truth[each.quantity, each.star]
         one.held.append(each.lower <= true <= each.upper)
         one.error.append(each.value - true)
         one.standard.append(each.standard_uncertainty)
-    for quantity in {name for name, _ in truth} - {each.quantity for each in stated}:
+    of_truth = {name for name, _ in truth} & set(quantities)
+    for quantity in of_truth - {each.quantity for each in stated}:
         for region in (
             REGIONS
             if quantity in QUANTITIES[:3]

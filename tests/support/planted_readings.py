@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.instruments.certify.readings import DotReadings, LightReadings
+from hilstar.instruments.certify.readings import BesideRatio, DotReadings, LightReadings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,6 +31,7 @@ DELAY_MS = 8.0
 EDGES, EDGE_NOISE_MS = 120, 0.1
 WAVES = 300  # cosines of a random field: its fourth moment is within 1 % of a Gaussian's
 TAILS_DOF = 3.0
+BESIDE_CODE, BESIDE_PAIRS = 140, 16
 SEEN_TANGENT = 512 / TRACKER_FOCAL_PX  # half of the tracker's field
 
 
@@ -79,6 +80,7 @@ class Truth:
     warms: float = 0.0
     warm_s: float = 1.0
     talk: float = 0.0
+    talk_of_left: float = 0.0
     tails: bool = False
     lasts_readings: float = 0.0
 
@@ -89,6 +91,34 @@ class Truth:
             for at, side in zip((x_px, y_px), SIZE_PX, strict=True)
         )
         return (1 - self.fall[0] * u**2 - self.fall[1] * v**2) * (1 + self.uneven(x_px, y_px))
+
+    def panel_light(self, codes: np.ndarray) -> np.ndarray:
+        """Light (..., h, w) above black of pixels by their codes and those of their neighbours;
+        beyond the edge are black ones.
+
+        By `talk` a pixel is brighter by that share of the mean code of the eight around it, relative
+        to white; by `talk_of_left` its code is that much nearer to that of the one at its left.
+        """
+        flat = [(0, 0)] * (codes.ndim - 2)
+        padded = np.pad(codes.astype(float), [*flat, (1, 1), (1, 1)])
+        height, width = codes.shape[-2:]
+        around = np.zeros(codes.shape)
+        for down in range(3):
+            for right in range(3):
+                around += padded[..., down : down + height, right : right + width]
+        around -= codes
+        left = padded[..., 1 : 1 + height, :width]
+        driven = codes + self.talk_of_left * (left - codes)
+        light = np.interp(driven, np.arange(256), self.light)
+        return light * (1 + self.talk * around / 8 / 255)
+
+    def lone_light(self) -> np.ndarray:
+        """Light (256,) of one lit pixel of each code on a black screen, with what it does to its
+        neighbours.
+        """
+        screens = np.zeros((256, 3, 3), dtype=int)
+        screens[:, 1, 1] = np.arange(256)
+        return self.panel_light(screens).sum(axis=(1, 2))
 
     def tangents(self, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
         """True directions (n, 2) of pixels, tangents in cam."""
@@ -199,8 +229,13 @@ def s_curve(rng: np.random.Generator) -> Truth:
 
 
 def talking(rng: np.random.Generator) -> Truth:
-    """A panel whose pixels are brighter or darker by 0.2 to 2 % beside lit ones, as in a star."""
-    return replace(supposed(rng), talk=_between(rng, 0.002, 0.02) * rng.choice([-1, 1]))
+    """A panel whose pixels are brighter or darker by 0.5 to 3 % among white ones, or have codes
+    that are 0.5 to 3 % nearer to those at their left.
+    """
+    one, size = supposed(rng), _between(rng, 0.005, 0.03)
+    if rng.integers(2):
+        return replace(one, talk_of_left=size)
+    return replace(one, talk=size * rng.choice([-1, 1]))
 
 
 def own_response(rng: np.random.Generator) -> Truth:
@@ -268,8 +303,19 @@ class PlantedReader:
         here = one.even(*(np.array([side // 2]) for side in SIZE_PX))[0]
         warmth = 1 + one.drift_per_h * t_s / 3600
         warmth += one.warms * (1 - np.exp(-t_s / one.warm_s))
-        level = (one.light[codes] + one.black) * one.white * here * warmth
-        return LightReadings(codes, level * (1 + one.reading_noise * self._series(len(codes))), t_s)
+        lone = one.lone_light()
+        level = (lone[codes] + one.black) * one.white * here * warmth
+        read = level * (1 + one.reading_noise * self._series(len(codes)))
+        return LightReadings(codes, read, t_s, beside=self._beside(lone))
+
+    def _beside(self, lone: np.ndarray) -> BesideRatio:
+        """A lattice of neighbouring pixels against single ones, in pairs of readings."""
+        one = self.is_so
+        screen = np.full((5, 5), BESIDE_CODE)
+        ratio = one.panel_light(screen)[2, 2] / lone[BESIDE_CODE]
+        error = one.reading_noise * math.sqrt(2 / BESIDE_PAIRS)
+        noise = one.reading_noise * self._noise((BESIDE_PAIRS, 2)).mean(axis=0)
+        return BesideRatio(ratio * (1 + noise[0] - noise[1]), error)
 
     def dots(self, x_px: np.ndarray, y_px: np.ndarray, images: int) -> DotReadings:
         """Dots through the true lens and the tracker's own, of the mean of some images."""
@@ -304,12 +350,14 @@ def true_figures(one: Truth, stars: list[ReferenceStar]) -> dict[tuple[str, int 
             [int(np.argmin(np.abs(expected - math.exp(light)))) for light in star.log_light]
         )
         x, y = np.array([star.x_px]), np.array([star.y_px])
-        # Light of a star's pixels is even over it: a field of 30 px changes by 0.1 % of itself over
-        # a star's sigma.
+        # Evenness is that at the star's middle: a field of 30 px changes by 0.1 % of itself over a
+        # star's sigma.
         here = one.white / WHITE_E_PER_S * one.even(np.rint(x), np.rint(y))[0]
-        found["flux", star.hip] = -2.5 * math.log10(
-            here * (1 + one.talk) * float(star.share @ (one.light[code] / expected[code]))
-        )
+        row, column = (star.pixel_px - star.pixel_px.min(axis=0)).T
+        screen = np.zeros((row.max() + 3, column.max() + 3), dtype=int)
+        screen[row + 1, column + 1] = code
+        light = one.panel_light(screen).sum() / expected[code].sum()
+        found["flux", star.hip] = -2.5 * math.log10(here * float(light))
         wanted = np.array(
             [(x[0] - (SIZE_PX[0] - 1) / 2) / FOCAL_PX, (y[0] - (SIZE_PX[1] - 1) / 2) / FOCAL_PX]
         )

@@ -26,6 +26,7 @@ BATCH = 5000
 # more
 DIFFER = 0.05
 SMALLEST = 1e-12
+SMALLEST_SQUARE = 1e-300  # of all contributions together, so that none have no share
 # a Student's t of few degrees of freedom shows from one per cent of the variance on
 FEW_DOF, FEW_SHARE = 10.0, 0.01
 MAX_DOF = 1e6
@@ -50,12 +51,16 @@ class Input:
 
     def draw(self, trials: int, rng: np.random.Generator) -> FloatArray:
         """Trials (trials, size)."""
+        shape = trials, self.size
         if self.distribution == "rectangular":
-            return np.asarray(rng.uniform(-math.sqrt(3), math.sqrt(3), (trials, self.size)))
+            half = math.sqrt(3)
+            return np.asarray(rng.uniform(-half, half, shape))
         if self.distribution == "triangular":
-            return np.asarray(rng.triangular(-math.sqrt(6), 0.0, math.sqrt(6), (trials, self.size)))
-        normal = rng.standard_normal((trials, self.size))
+            half = math.sqrt(6)
+            return np.asarray(rng.triangular(-half, 0.0, half, shape))
+        normal = rng.standard_normal(shape)
         if math.isfinite(self.dof):
+            # Variables of one input share the estimate of their spread.
             normal /= np.sqrt(rng.chisquare(self.dof, trials) / self.dof)[:, None]
         return np.asarray(normal)
 
@@ -94,28 +99,27 @@ class BudgetTrials:
 
 def first_order(model: Model, inputs: list[Input]) -> Combined:
     """Combine the inputs by the slopes of the model."""
-    zeros = [np.zeros((1, budget_input.size)) for budget_input in inputs]
-    value = model(zeros)[0]
-    columns = []
-    for number, budget_input in enumerate(inputs):
-        steps = STEP * np.concatenate([np.eye(budget_input.size), -np.eye(budget_input.size)])
-        moved = [np.zeros((len(steps), other.size)) for other in inputs]
-        moved[number] = steps
-        high, low = np.split(model(moved), 2)
-        columns.append(np.sqrt((((high - low) / (2 * STEP)) ** 2).sum(axis=0)))
-    if columns:
-        contribution = np.stack(columns, axis=1)
-    else:
-        contribution = np.zeros((len(value), 0))
+    value = model([np.zeros((1, budget_input.size)) for budget_input in inputs])[0]
+    contribution = np.zeros((len(value), len(inputs)))
+    for number in range(len(inputs)):
+        contribution[:, number] = np.linalg.norm(_slopes(model, inputs, number), axis=0)
     standard = np.sqrt((contribution**2).sum(axis=1))
-    finite = np.array([1 / budget_input.dof for budget_input in inputs])
+    inverse_dof = np.array([1 / budget_input.dof for budget_input in inputs])
     with np.errstate(divide="ignore", invalid="ignore"):
-        dof = np.minimum(
-            np.nan_to_num(standard**4 / (contribution**4 @ finite), nan=MAX_DOF, posinf=MAX_DOF),
-            MAX_DOF,
-        )
+        dof = standard**4 / (contribution**4 @ inverse_dof)
+    dof = np.minimum(np.nan_to_num(dof, nan=MAX_DOF, posinf=MAX_DOF), MAX_DOF)
     k = stdtrit(dof, (1 + COVERAGE) / 2)
     return Combined(value, standard, dof, value - k * standard, value + k * standard, contribution)
+
+
+def _slopes(model: Model, inputs: list[Input], number: int) -> FloatArray:
+    """The slopes (size, figures) of the model by the variables of one input."""
+    size = inputs[number].size
+    steps = STEP * np.concatenate([np.eye(size), -np.eye(size)])
+    moved = [np.zeros((len(steps), budget_input.size)) for budget_input in inputs]
+    moved[number] = steps
+    high, low = np.split(model(moved), 2)
+    return np.asarray((high - low) / (2 * STEP))
 
 
 def by_trials(
@@ -131,14 +135,19 @@ def by_trials(
         figures = model([budget_input.draw(BATCH, rng) for budget_input in inputs])
         low, high = np.quantile(figures, tails, axis=0)
         batches.append(np.stack([figures.mean(axis=0), figures.std(axis=0, ddof=1), low, high]))
-        if len(batches) > 1:
-            all_of = np.stack(batches)
-            error = 2 * all_of.std(axis=0, ddof=1) / math.sqrt(len(batches))
-            standard = all_of[:, 1].mean(axis=0)
-            tolerance = 0.5 * 10.0 ** (np.floor(np.log10(np.maximum(standard, SMALLEST))) - 1)
-            settled = bool((error[1:] <= tolerance)[:, standard > SMALLEST].all())
+        settled = len(batches) > 1 and _settled(np.stack(batches))
     mean, standard, low, high = np.stack(batches).mean(axis=0)
     return BudgetTrials(mean, standard, low, high, len(batches) * BATCH, settled)
+
+
+def _settled(batches: FloatArray) -> bool:
+    """Whether two digits of each figure's standard deviation and of both ends stand, by the batches
+    (n, 4, figures): mean, standard deviation, lower and upper end.
+    """
+    error = 2 * batches.std(axis=0, ddof=1) / math.sqrt(len(batches))
+    standard = batches[:, 1].mean(axis=0)
+    tolerance = 0.5 * 10.0 ** (np.floor(np.log10(np.maximum(standard, SMALLEST))) - 1)
+    return bool((error[1:] <= tolerance)[:, standard > SMALLEST].all())
 
 
 def why_they_differ(
@@ -148,18 +157,15 @@ def why_they_differ(
     their half width.
     """
     half = (combined.upper[number] - combined.lower[number]) / 2
-    off = max(
-        abs(combined.lower[number] - drawn.lower[number]),
-        abs(combined.upper[number] - drawn.upper[number]),
-    )
-    if half <= SMALLEST or off <= DIFFER * half:
+    below = drawn.lower[number] - combined.lower[number]
+    above = drawn.upper[number] - combined.upper[number]
+    if half <= SMALLEST or max(abs(below), abs(above)) <= DIFFER * half:
         return ""
-    share = combined.contribution[number] ** 2 / max(
-        float((combined.contribution[number] ** 2).sum()), 1e-300
-    )
+    squares = combined.contribution[number] ** 2
+    share = squares / max(float(squares.sum()), SMALLEST_SQUARE)
     largest = inputs[int(np.argmax(share))]
-    middle = (drawn.upper[number] + drawn.lower[number]) / 2 - combined.value[number]
-    if abs(middle) > DIFFER * half:
+    middle = (drawn.upper[number] + drawn.lower[number]) / 2
+    if abs(middle - combined.value[number]) > DIFFER * half:
         return (
             "the model is not linear over the inputs' range: its interval is not even about the"
             " value"

@@ -4,12 +4,14 @@ files, dates, its number.
 
 import datetime
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
 from hilstar.basics.version import __version__
 from hilstar.display.calibration import BUILT_IN
@@ -19,6 +21,7 @@ from hilstar.instruments.certify.budget import (
     MAX_DOF,
     BudgetTrials,
     Combined,
+    Input,
     by_trials,
     first_order,
     why_they_differ,
@@ -43,6 +46,7 @@ MAX_TRIALS, QUICK_TRIALS = 200_000, 10_000
 MAX_FILE_BYTES = 500_000_000
 SEED = 11
 DIGITS = 6
+SMALLEST = 1e-300  # of all contributions together, so that none have no share
 MEASURANDS = {
     "flux": (
         "light that the star's codes make at its place, over what the bench file says they make,"
@@ -98,88 +102,95 @@ def certify(
 
     `warm_up` and `checked` are as in `assemble`. Raises InputError, MachineError.
     """
-    if reader is None:
-        read = None
-    else:
+    read = reference = monitor = None
+    read_by = "nothing was read: by the calibration files"
+    if reader is not None:
         read = read_bench(file, reader)
-    if reader is None:
-        reference = None
-    else:
         reference = msgspec.json.encode(take_check(file, reader))
+        read_by = reader.identity
+        monitor = reader.monitor
     budget = assemble(file, read, warm_up, checked)
     combined = first_order(budget.model, budget.inputs)
-    drawn = by_trials(
-        budget.model,
-        budget.inputs,
-        np.random.default_rng(SEED),
-        QUICK_TRIALS if quick else MAX_TRIALS,
-    )
+    max_trials = QUICK_TRIALS if quick else MAX_TRIALS
+    drawn = by_trials(budget.model, budget.inputs, np.random.default_rng(SEED), max_trials)
     truth = None
     if reader is not None and reader.truth is not None:
-        truth = budget.figures.of(true_deviations(budget.figures, reader.truth))[0]
-    figures = _figures(file, budget, combined, drawn, truth)
+        true = true_deviations(budget.figures, reader.truth)
+        truth = budget.figures.of(true)[0]
+    figures = list(_figures(file, budget, combined, drawn, truth))
     judged = [figure.conforms for figure in figures if figure.conforms is not None]
-    config = file.config
     settings = file.config.certify
     files = files_of(file)
-    made = now.astimezone(datetime.UTC).isoformat(timespec="seconds")
-    core = msgspec.json.encode([file.sha256, files, made, figures])
-    settings_of = msgspec.to_builtins(config.collimator) | {"file": config.collimator.geometry}
+    utc = now.astimezone(datetime.UTC)
+    made = utc.isoformat(timespec="seconds")
+    core = sha256_of(msgspec.json.encode([file.sha256, files, made, figures]))
+    expires = utc.date() + datetime.timedelta(days=settings.valid_days)
+    collimator = msgspec.to_builtins(file.config.collimator)
+    collimator["file"] = file.config.collimator.geometry
+    instrument = {}
+    if settings.instrument.name:
+        instrument = msgspec.to_builtins(settings.instrument)
+    reference_sha256 = None
+    if reference is not None:
+        reference_sha256 = sha256_of(reference)
+    conforms = None
+    if judged:
+        conforms = all(judged)
     certificate = Certificate(
         kind=KIND,
-        number=f"H{made[:10].replace('-', '')}-{sha256_of(core)[:8]}",
+        number=f"H{made[:10].replace('-', '')}-{core[:8]}",
         made=made,
-        valid_until=(
-            now.astimezone(datetime.UTC).date() + datetime.timedelta(days=settings.valid_days)
-        ).isoformat(),
+        valid_until=expires.isoformat(),
         hilstar=__version__,
         bench=file.path.name,
         bench_sha256=file.sha256,
         files=files,
-        monitor=_monitor(file, None if reader is None else reader.monitor),
-        collimator={key: value for key, value in settings_of.items() if value is not None},
-        read_by="nothing was read: by the calibration files" if reader is None else reader.identity,
+        monitor=_monitor(file, monitor),
+        collimator={key: value for key, value in collimator.items() if value is not None},
+        read_by=read_by,
         who=settings.who,
         where=settings.where,
         ambient=settings.ambient,
         traceability=settings.traceability,
-        instrument=msgspec.to_builtins(settings.instrument) if settings.instrument.name else {},
+        instrument=instrument,
         decision=settings.decision,
-        conforms=all(judged) if judged else None,
+        conforms=conforms,
         trials=drawn.trials,
         two_digits_stand=drawn.settled,
-        inputs=[
-            InputRow(
-                name=figure.name,
-                distribution=figure.distribution,
-                standard_uncertainty=_rounded(figure.standard),
-                unit=figure.unit,
-                dof=figure.dof if math.isfinite(figure.dof) else None,
-                source=figure.source,
-            )
-            for figure in budget.inputs
-        ],
+        inputs=[_input_row(budget_input) for budget_input in budget.inputs],
         figures=figures,
         not_assessed=[*budget.not_assessed, *_never_assessed(settings)],
         measurands=MEASURANDS,
-        reference_sha256=None if reference is None else sha256_of(reference),
+        reference_sha256=reference_sha256,
         replaces=replaces,
     )
     certificate = msgspec.structs.replace(certificate, cube=cube_to_boresight(file, certificate))
     return certificate, reference
 
 
+def _input_row(budget_input: Input) -> InputRow:
+    """An input as the certificate has it."""
+    dof = None
+    if math.isfinite(budget_input.dof):
+        dof = budget_input.dof
+    return InputRow(
+        name=budget_input.name,
+        distribution=budget_input.distribution,
+        standard_uncertainty=_rounded(budget_input.standard),
+        unit=budget_input.unit,
+        dof=dof,
+        source=budget_input.source,
+    )
+
+
 def _never_assessed(settings: CertifySettings) -> list[str]:
+    """What no certificate assesses, and what `[certify]` does not say."""
     reasons = [
-        "focus, stray light and the shape of stars: the figures are of their light and middle",
-        "pixels that change each other's light: a star's is taken as the sum of its pixels, each as"
-        " it is read among others of its code or of black",
+        "focus, stray light and the shape of stars: the figures are of their light and middle"
     ]
-    reasons += [
-        f"{what} is not written in [certify]"
-        for what in ("who", "where", "ambient", "traceability")
-        if not getattr(settings, what)
-    ]
+    for key in ("who", "where", "ambient", "traceability"):
+        if not getattr(settings, key):
+            reasons.append(f"{key} is not written in [certify]")
     return reasons
 
 
@@ -188,79 +199,105 @@ def _figures(
     budget: Assembled,
     combined: Combined,
     drawn: BudgetTrials,
-    truth: np.ndarray[Any, Any] | None,
-) -> list[CertifiedFigure]:
-    rows, settings = [], file.config.certify
-    unknown = {reason.partition(":")[0] for reason in budget.not_assessed}
-    missing = {name for key, names in UNKNOWN.items() if key in unknown for name in names}
+    truth: FloatArray | None,
+) -> Iterator[CertifiedFigure]:
+    """The figures that were assessed, each with the interval by first order, and by trials where
+    the two differ; `truth` (figures,) is that of a virtual bench.
+    """
+    missing: set[str] = set()
+    for reason in budget.not_assessed:
+        missing.update(UNKNOWN.get(reason.partition(":")[0], ()))
     for number, (quantity, which, unit) in enumerate(budget.names):
         if quantity in missing:
             continue
-        star = (
-            budget.figures.stars[which]
-            if quantity.removeprefix("star_") in ("flux", "place_along", "place_across")
-            else None
-        )
-        field = (
-            -1 - which if quantity.startswith("attitude") else None if star is None else star.field
-        )
-        region = (
-            "screen"
-            if quantity == "latency"
-            else f"field {field}"
-            if star is None
-            else THIRDS[star.third]
-        )
+        star, field, region = _place_of(budget, quantity, which)
         standard = float(combined.standard[number])
-        shares = combined.contribution[number]
-        ranked = [k for k in np.argsort(-shares, kind="stable") if shares[k] > 0]
-        key = LIMITS.get(quantity)
-        limit = None if key is None else getattr(settings, key)
         why = why_they_differ(combined, drawn, budget.inputs, number)
-        lower, upper = (drawn.lower, drawn.upper) if why else (combined.lower, combined.upper)
+        interval: Combined | BudgetTrials = combined
+        if why:
+            interval = drawn
+        lower = float(interval.lower[number])
+        upper = float(interval.upper[number])
         value = float(combined.value[number])
-        nominal = file.config.monitor.panel_delay_ms if quantity == "latency" else 0.0
-        ends = (value,) if settings.decision == "simple" else (lower[number], upper[number])
-        dof = float(combined.dof[number])
-        rows.append(
-            CertifiedFigure(
-                quantity=quantity,
-                region=region,
-                star=None if star is None else star.hip,
-                field=field,
-                value=_rounded(value),
-                standard_uncertainty=_rounded(standard),
-                k=_rounded(float(combined.upper[number] - value) / standard) if standard else 0.0,
-                lower=_rounded(float(lower[number])),
-                upper=_rounded(float(upper[number])),
-                unit=unit,
-                dof=round(dof, 1) if dof < MAX_DOF else None,
-                limit=limit,
-                conforms=(
-                    None if limit is None else all(abs(end - nominal) <= limit for end in ends)
-                ),
-                truth=(
-                    _rounded(float(truth[number]))
-                    if truth is not None and number < len(truth)
-                    else None
-                ),
-                by_trials=ByTrials(
-                    standard_uncertainty=_rounded(float(drawn.standard[number])),
-                    lower=_rounded(float(drawn.lower[number])),
-                    upper=_rounded(float(drawn.upper[number])),
-                    differs=why,
-                ),
-                contributions=[
-                    Contribution(
-                        input=budget.inputs[k].name,
-                        standard_uncertainty=_rounded(float(shares[k])),
-                        share=round(float(shares[k] ** 2 / max(standard**2, 1e-300)), 4),
-                    )
-                    for k in ranked
-                ],
-            )
+        k = 0.0
+        if standard:
+            k = float(combined.upper[number] - value) / standard
+        dof = None
+        if combined.dof[number] < MAX_DOF:
+            dof = round(float(combined.dof[number]), 1)
+        limit, conforms = _judged(file, quantity, value, (lower, upper))
+        true = None
+        if truth is not None and number < len(truth):
+            true = _rounded(float(truth[number]))
+        yield CertifiedFigure(
+            quantity=quantity,
+            region=region,
+            star=star,
+            field=field,
+            value=_rounded(value),
+            standard_uncertainty=_rounded(standard),
+            k=_rounded(k),
+            lower=_rounded(lower),
+            upper=_rounded(upper),
+            unit=unit,
+            dof=dof,
+            limit=limit,
+            conforms=conforms,
+            truth=true,
+            by_trials=ByTrials(
+                standard_uncertainty=_rounded(float(drawn.standard[number])),
+                lower=_rounded(float(drawn.lower[number])),
+                upper=_rounded(float(drawn.upper[number])),
+                differs=why,
+            ),
+            contributions=_contributions(budget.inputs, combined.contribution[number]),
         )
-    return rows
+
+
+def _place_of(budget: Assembled, quantity: str, which: int) -> tuple[int | None, int | None, str]:
+    """The star (HIP), the field and the region of a figure."""
+    if quantity == "latency":
+        return None, None, "screen"
+    if quantity.startswith("attitude"):
+        field = -1 - which
+        return None, field, f"field {field}"
+    star = budget.figures.stars[which]
+    return star.hip, star.field, THIRDS[star.third]
+
+
+def _judged(
+    file: BenchFile, quantity: str, value: float, interval: tuple[float, float]
+) -> tuple[float | None, bool | None]:
+    """The limit of a figure, and whether it conforms by the decision rule; None without a limit."""
+    settings = file.config.certify
+    limit: float | None = None
+    if quantity in LIMITS:
+        limit = getattr(settings, LIMITS[quantity])
+    if limit is None:
+        return None, None
+    nominal = 0.0
+    if quantity == "latency":
+        nominal = file.config.monitor.panel_delay_ms
+    ends: tuple[float, ...] = interval
+    if settings.decision == "simple":
+        ends = (value,)
+    return limit, all(abs(end - nominal) <= limit for end in ends)
+
+
+def _contributions(inputs: list[Input], shares: FloatArray) -> list[Contribution]:
+    """What each input that counts contributes to a figure, the largest first."""
+    total = max(float((shares**2).sum()), SMALLEST)
+    contributions = []
+    for k in np.argsort(-shares, kind="stable"):
+        size = float(shares[k])
+        if size > 0:
+            contribution = Contribution(
+                input=inputs[k].name,
+                standard_uncertainty=_rounded(size),
+                share=round(size**2 / total, 4),
+            )
+            contributions.append(contribution)
+    return contributions
 
 
 def _rounded(value: float) -> float:
@@ -277,28 +314,31 @@ def files_of(file: BenchFile) -> dict[str, str]:
         config.collimator.geometry,
         config.tracker.distortion,
         config.tracker.optics.psf,
-    ]
-    named += [
         *config.tracker.quantum_efficiencies.values(),
         config.tracker.transmission,
         config.sky.catalogue,
     ]
     for name in named:
-        if not isinstance(name, str) or name in BUILT_IN or not (file.folder / name).is_file():
+        if not isinstance(name, str) or name in BUILT_IN:
             continue
         path = file.folder / name
+        if not path.is_file():
+            continue
         hashes[name] = sha256_of(read_bytes(path, "", MAX_FILE_BYTES))
         if path.suffix == ".toml":
-            table = parse_toml(path, read_text(path, "", MAX_TOML_BYTES))
-            for inner in (
-                table.get("calibration", {}).get("response"),
-                table.get("uniformity", {}).get("file"),
-            ):
-                if isinstance(inner, str) and (path.parent / inner).is_file():
-                    hashes[str(Path(name).parent / inner)] = sha256_of(
-                        read_bytes(path.parent / inner, "", MAX_FILE_BYTES)
-                    )
+            for inner in _named_in(path):
+                data = read_bytes(path.parent / inner, "", MAX_FILE_BYTES)
+                hashes[str(Path(name).parent / inner)] = sha256_of(data)
     return hashes
+
+
+def _named_in(path: Path) -> Iterator[str]:
+    """The files beside a calibration file that it names."""
+    tables = parse_toml(path, read_text(path, "", MAX_TOML_BYTES))
+    for table, key in (("calibration", "response"), ("uniformity", "file")):
+        name = tables.get(table, {}).get(key)
+        if isinstance(name, str) and (path.parent / name).is_file():
+            yield name
 
 
 def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
@@ -306,13 +346,13 @@ def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
     the calibration files.
     """
     monitor = file.config.monitor
-    if now is not None:
-        named = [now]
-    else:
+    identity = now
+    if identity is None:
         named = [origin.identity for origin in measured_on(file) if origin.identity is not None]
+        identity = next(iter(named), None)
     return {
         "resolution_px": list(monitor.resolution_px),
         "refresh_hz": monitor.refresh_hz,
         "calibration": monitor.calibration,
-        "identity": named[0].known() if named else {},
+        "identity": {} if identity is None else identity.known(),
     }

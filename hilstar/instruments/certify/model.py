@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
@@ -36,8 +36,11 @@ ALONE_SIGMAS, REACH_SIGMAS = 9.0, 4.0
 EDGE_TRACKER_PX = 10.0
 STARS_A_THIRD = 4
 NO_LIGHT = 1e-6
+SMALLEST = 1e-300  # of a sine, so that no rotation is none
 MIN_STARS = 3  # for an attitude
 THIRDS = ("left third", "middle third", "right third")
+STAR_QUANTITIES = (("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec"))
+AXES = ("attitude_x", "attitude_y", "attitude_z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +48,8 @@ class ReferenceStar:
     """A star of a reference field: its place on the monitor, its direction in cam, and its pixels
     with their shares of light.
 
-    `log_light` (p,) is that asked of its pixels, relative to white, `quantised_mag` how much too
-    faint their codes make it.
+    `log_light` (p,) is that asked of its pixels, relative to white, `pixel_px` (p, 2) their rows
+    and columns on the screen, `quantised_mag` how much too faint their codes make it.
     """
 
     hip: int
@@ -61,6 +64,7 @@ class ReferenceStar:
     quantised_mag: float
     log_light: FloatArray
     share: FloatArray
+    pixel_px: IntArray
 
 
 def reference_stars(file: BenchFile) -> list[ReferenceStar]:
@@ -69,15 +73,17 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
     """
     rng = np.random.default_rng(SEED)
     stars: list[ReferenceStar] = []
-    attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
+    attitudes = rng.normal(size=(ATTITUDES, 4))
+    attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
     geometry = geometry_of(file)
+    number = 0
     with open_bench(file) as bench:
-        fullest = sorted(attitudes, key=lambda q: -len(bench.sprites(q)))
-        for q in fullest:
-            found = _of_field(bench, bench.frame(q), len({star.field for star in stars}), geometry)
-            if len(found) >= MIN_STARS:
-                stars += found
-            if len({star.field for star in stars}) == file.config.certify.fields:
+        for q in sorted(attitudes, key=lambda q: -len(bench.sprites(q))):
+            members = _of_field(bench, bench.frame(q), number, geometry)
+            if len(members) >= MIN_STARS:
+                stars += members
+                number += 1
+            if number == file.config.certify.fields:
                 break
     if not stars:
         raise InputError(
@@ -90,73 +96,100 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
 def _of_field(
     bench: Bench, frame: Frame, number: int, geometry: BenchGeometry
 ) -> list[ReferenceStar]:
-    truth = frame.rows
-    sigma = max(bench.psf.width_px)
-    vectors = bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T
-    x = truth["x_px"].astype(np.float64)
-    y = truth["y_px"].astype(np.float64)
-    places = np.nan_to_num(np.stack([x, y], axis=1), nan=-1e6)
-    near = cKDTree(places).query_ball_point(places, ALONE_SIGMAS * sigma, return_length=True)
-    reach, (width, height) = math.ceil(REACH_SIGMAS * sigma), bench.camera.resolution_px
-    is_usable = (
-        truth["drawn"] & ~truth["clipped"] & (near == 1) & (bench.stars.row[frame.star] >= 0)
-    )
-    is_usable &= _seen(geometry, x, y)
-    is_usable &= (
-        (x > reach + 1) & (x < width - 2 - reach) & (y > reach + 1) & (y < height - 2 - reach)
-    )
+    rows = frame.rows
+    x = rows["x_px"].astype(np.float64)
+    y = rows["y_px"].astype(np.float64)
     third = thirds(geometry, x)
+    usable = np.flatnonzero(_usable(bench, frame, geometry))
     shown = shown_light(frame.levels, bench.panel)
+    vectors = bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T
     stars = []
     for third_number in range(len(THIRDS)):
-        here = np.flatnonzero(is_usable & (third == third_number))  # the brightest first
-        for k in (
-            here[np.unique(np.linspace(0, len(here) - 1, STARS_A_THIRD).astype(int))]
-            if len(here)
-            else []
-        ):
-            rows, columns = (slice(round(at) - reach, round(at) + reach + 1) for at in (y[k], x[k]))
-            light = shown[rows, columns].ravel()
-            level = frame.levels[rows, columns].ravel()
-            wanted = float(frame.linear[rows, columns].sum(dtype=np.float64))
+        members = usable[third[usable] == third_number]  # the brightest first
+        if not len(members):
+            continue
+        steps = np.linspace(0, len(members) - 1, STARS_A_THIRD)
+        picked = np.unique(steps.astype(np.intp))
+        for k in members[picked]:
+            pixel_px = _window(bench, x[k], y[k])
+            at = pixel_px[:, 0], pixel_px[:, 1]
+            light = shown[at]
+            wanted = float(frame.linear[at].sum(dtype=np.float64))
             lit = light > 0
             if not lit.any() or wanted <= 0:
                 continue
+            total = float(light.sum())
+            levels = frame.levels[at][lit]
             star = ReferenceStar(
-                hip=int(truth["hip"][k]),
+                hip=int(rows["hip"][k]),
                 row=int(bench.stars.row[frame.star[k]]),
-                v_mag=float(truth["v_mag"][k]),
-                b_v_mag=float(truth["bv"][k]),
+                v_mag=float(rows["v_mag"][k]),
+                b_v_mag=float(rows["bv"][k]),
                 field=number,
                 third=third_number,
                 x_px=float(x[k]),
                 y_px=float(y[k]),
                 direction=vectors[k],
-                quantised_mag=float(magnitude(float(light.sum()) / wanted)),
-                log_light=np.log(bench.calibration.response.light[level[lit]]),
-                share=light[lit] / light[lit].sum(),
+                quantised_mag=float(magnitude(total / wanted)),
+                log_light=np.log(bench.calibration.response.light[levels]),
+                share=light[lit] / total,
+                pixel_px=pixel_px[lit],
             )
             stars.append(star)
     return stars
 
 
-def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+def _usable(bench: Bench, frame: Frame, geometry: BenchGeometry) -> BoolArray:
+    """Which rows of a frame are stars that stand alone, whole on the monitor and seen by the
+    tracker.
+    """
+    rows = frame.rows
+    x = rows["x_px"].astype(np.float64)
+    y = rows["y_px"].astype(np.float64)
+    places = np.nan_to_num(np.stack([x, y], axis=1), nan=-1e6)
+    radius_px = ALONE_SIGMAS * max(bench.psf.width_px)
+    near = cKDTree(places).query_ball_point(places, radius_px, return_length=True)
+    usable = rows["drawn"] & ~rows["clipped"] & (near == 1)
+    usable &= bench.stars.row[frame.star] >= 0
+    usable &= _seen(geometry, x, y)
+    edge_px = _reach(bench) + 1
+    for at, size in zip((x, y), bench.camera.resolution_px, strict=True):
+        usable &= (at > edge_px) & (at < size - 1 - edge_px)
+    return np.asarray(usable)
+
+
+def _reach(bench: Bench) -> int:
+    """The pixels of a star to each side of its middle."""
+    return math.ceil(REACH_SIGMAS * max(bench.psf.width_px))
+
+
+def _window(bench: Bench, x_px: float, y_px: float) -> IntArray:
+    """The rows and columns (n, 2) of the pixels about a place."""
+    reach = _reach(bench)
+    about = np.arange(-reach, reach + 1, dtype=np.intp)
+    row, column = np.meshgrid(round(y_px) + about, round(x_px) + about, indexing="ij")
+    return np.stack([row.ravel(), column.ravel()], axis=1)
+
+
+def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
+    """Which places (n,) on the monitor the tracker sees, its edge aside."""
     at = np.stack(geometry.to_tracker(x_px, y_px))
     size = np.array(geometry.tracker.resolution_px)[:, None]
     with np.errstate(invalid="ignore"):
-        return np.asarray(((at > EDGE_TRACKER_PX) & (at < size - 1 - EDGE_TRACKER_PX)).all(axis=0))
+        inside = (at > EDGE_TRACKER_PX) & (at < size - 1 - EDGE_TRACKER_PX)
+    return np.asarray(inside.all(axis=0))
 
 
 def thirds(geometry: BenchGeometry, x_px: FloatArray) -> IntArray:
     """The third (n,) of what the tracker sees of the screen, 0 at the left, by columns."""
     along, down = geometry.monitor.grid_px((181, 61))
-    visible_along = along[_seen(geometry, along, down)]
-    low, high = (
-        (float(visible_along.min()), float(visible_along.max()))
-        if len(visible_along)
-        else (0.0, float(geometry.monitor.resolution_px[0]))
-    )
-    return np.asarray(np.clip((x_px - low) / max(high - low, 1.0) * 3, 0, 2).astype(np.intp))
+    visible = along[_seen(geometry, along, down)]
+    if not len(visible):
+        visible = np.array([0.0, geometry.monitor.resolution_px[0]])
+    low = float(visible.min())
+    width = max(float(visible.max()) - low, 1.0)
+    third = np.floor((x_px - low) / width * len(THIRDS))
+    return np.asarray(np.clip(third, 0, len(THIRDS) - 1).astype(np.intp))
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,35 +217,25 @@ class Figures:
     def __init__(self, file: BenchFile, stars: list[ReferenceStar]) -> None:
         self.stars = stars
         self.file = file
-        self.log_light, place = np.unique(
-            np.concatenate([star.log_light for star in stars]), return_inverse=True
-        )
+        lights = np.concatenate([star.log_light for star in stars])
+        self.log_light, place = np.unique(lights, return_inverse=True)
         self._shares = np.zeros((len(stars), len(self.log_light)))
-        start = 0
-        for number, star in enumerate(stars):
-            np.add.at(self._shares[number], place[start : start + len(star.share)], star.share)
-            start += len(star.share)
-        self.x_px, self.y_px = (
-            np.array([getattr(star, name) for star in stars]) for name in ("x_px", "y_px")
-        )
+        pixels = [len(star.share) for star in stars]
+        star_of = np.repeat(np.arange(len(stars)), pixels)
+        shares = np.concatenate([star.share for star in stars])
+        np.add.at(self._shares, (star_of, place), shares)
+        self.x_px = np.array([star.x_px for star in stars])
+        self.y_px = np.array([star.y_px for star in stars])
         self._direction = np.stack([star.direction for star in stars])
         self.tangent = self._direction[:, :2] / self._direction[:, 2:]
-        fields = np.array([star.field for star in stars])
-        self._of_field = [
-            np.flatnonzero(fields == number) for number in range(int(fields.max()) + 1)
-        ]
-        star_quantities = [("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec")]
-        self.names = [
-            (quantity, star, unit)
-            for quantity, unit in star_quantities
-            for star in range(len(stars))
-        ]
-        axes = [("attitude_x", "arcsec"), ("attitude_y", "arcsec"), ("attitude_z", "arcsec")]
-        self.names += [
-            (quantity, -1 - field, unit)
-            for field in range(len(self._of_field))
-            for quantity, unit in axes
-        ]
+        field = np.array([star.field for star in stars])
+        fields = int(field.max()) + 1
+        self._of_field = [np.flatnonzero(field == number) for number in range(fields)]
+        self.names: list[tuple[str, int, str]] = []
+        for quantity, unit in STAR_QUANTITIES:
+            self.names += [(quantity, star, unit) for star in range(len(stars))]
+        for number in range(len(self._of_field)):
+            self.names += [(quantity, -1 - number, "arcsec") for quantity in AXES]
         self.names.append(("latency", 0, "ms"))
 
     def turned(self, turns_arcsec: FloatArray) -> FloatArray:
@@ -221,7 +244,10 @@ class Figures:
         """
         u, v = self.tangent.T
         a, b, c = turns_arcsec.T[:, :, None]
-        return np.stack([b - c * v - u * (a * v - b * u), c * u - a - v * (a * v - b * u)], axis=2)
+        deeper = a * v - b * u
+        along = b - c * v - u * deeper
+        across = c * u - a - v * deeper
+        return np.stack([along, across], axis=2)
 
     def of(self, off: Deviations) -> FloatArray:
         """The figures (b, figures): flux mag (fainter is positive), places arcsec, attitudes
@@ -229,18 +255,15 @@ class Figures:
         """
         certify = self.file.config.certify
         monitor = self.file.config.monitor
-        flux = (
-            magnitude(np.maximum(off.levels @ self._shares.T, NO_LIGHT))
-            - MAG_PER_RELATIVE * off.even
-        )
+        light = np.maximum(off.levels @ self._shares.T, NO_LIGHT)
+        flux = magnitude(light) - MAG_PER_RELATIVE * off.even
         late_ms = off.delay_ms - monitor.panel_delay_ms + off.late_ms
         place = off.place_arcsec.copy()
         # deg/s to arcsec/ms; what is late lags behind
         place[..., 0] -= certify.rate_deg_s * 3.6 * late_ms[:, None]
-        turned = [self._attitude(place[:, stars], stars) for stars in self._of_field]
-        return np.concatenate(
-            [flux, place[..., 0], place[..., 1], *turned, off.delay_ms[:, None]], axis=1
-        )
+        columns = [flux, place[..., 0], place[..., 1]]
+        columns += [self._attitude(place[:, stars], stars) for stars in self._of_field]
+        return np.concatenate([*columns, off.delay_ms[:, None]], axis=1)
 
     def _attitude(self, place_arcsec: FloatArray, stars: IntArray) -> FloatArray:
         """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported
@@ -249,48 +272,47 @@ class Figures:
         rays = np.ones((len(place_arcsec), len(stars), 3))
         rays[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
         rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-        u, _, right = np.linalg.svd(np.einsum("bsi,sj->bij", rays, self._direction[stars]))
+        profile = np.einsum("bsi,sj->bij", rays, self._direction[stars])
+        u, _, right = np.linalg.svd(profile)
         u[..., 2] *= np.linalg.det(u @ right)[:, None]
         turn = u @ right
+        skew = turn - turn.transpose(0, 2, 1)
         # The axial vector of a rotation by an angle a is 2 sin(a) times its axis.
-        axial = np.stack(
-            [
-                turn[:, 2, 1] - turn[:, 1, 2],
-                turn[:, 0, 2] - turn[:, 2, 0],
-                turn[:, 1, 0] - turn[:, 0, 1],
-            ],
-            axis=1,
-        )
-        sine = np.linalg.norm(axial, axis=1, keepdims=True) / 2
-        return np.asarray(
-            axial
-            / 2
-            * ARCSEC_PER_RAD
-            * np.arcsin(np.clip(sine, 1e-300, 1.0))
-            / np.maximum(sine, 1e-300)
-        )
+        axial = skew[:, (2, 0, 1), (1, 2, 0)] / 2
+        sine = np.linalg.norm(axial, axis=1, keepdims=True)
+        sine = np.clip(sine, SMALLEST, 1.0)
+        angle = np.arcsin(sine)
+        return np.asarray(axial * ARCSEC_PER_RAD * angle / sine)
 
 
 def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
     """The deviations of a bench whose truth is known (b = 1), at its reference stars."""
     file = figures.file
-    mine = grey_response(file)
-    its = grey_response(truth)
-    levels = np.interp(figures.log_light, np.log(mine.light[1:]), its.light[1:] / mine.light[1:])
+    stated = grey_response(file).light[1:]
+    ratio = grey_response(truth).light[1:] / stated
+    levels = np.interp(figures.log_light, np.log(stated), ratio)
     levels *= white_of(truth) / white_of(file)
-    even = np.zeros(len(figures.stars))
-    rays = []
     here_px = figures.x_px, figures.y_px
-    places_px = in_true_image(file, truth, *here_px), here_px
-    for sign, bench, (x_px, y_px) in zip((1, -1), (truth, file), places_px, strict=True):
-        size_px = bench.config.monitor.resolution_px
-        known = bench_calibration(bench.config, bench.folder).uniformity_map(size_px)
-        if known is not None:
-            row = np.rint(y_px).astype(np.intp)
-            column = np.rint(x_px).astype(np.intp)
-            even += sign * np.log(known[row, column].astype(np.float64))
-        rays.append(geometry_of(bench).monitor.rays(x_px, y_px))
-    shown, wanted = rays
-    place = (shown[:, :2] / shown[:, 2:] - wanted[:, :2] / wanted[:, 2:]) * ARCSEC_PER_RAD
-    delay = np.array([truth.config.monitor.panel_delay_ms])
-    return Deviations(levels[None], even[None], place[None], delay, np.zeros(1))
+    true_px = in_true_image(file, truth, *here_px)
+    even = np.log(_evenness_at(truth, *true_px) / _evenness_at(file, *here_px))
+    tangents = _tangents_at(truth, *true_px) - _tangents_at(file, *here_px)
+    place_arcsec = tangents * ARCSEC_PER_RAD
+    delay_ms = np.array([truth.config.monitor.panel_delay_ms])
+    return Deviations(levels[None], even[None], place_arcsec[None], delay_ms, np.zeros(1))
+
+
+def _evenness_at(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """A bench's relative light (n,) at pixels."""
+    size_px = file.config.monitor.resolution_px
+    known = bench_calibration(file.config, file.folder).uniformity_map(size_px)
+    if known is None:
+        return np.ones(len(x_px))
+    row = np.rint(y_px).astype(np.intp)
+    column = np.rint(x_px).astype(np.intp)
+    return known[row, column].astype(np.float64)
+
+
+def _tangents_at(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Where a bench's collimator shows pixels (n, 2), tangents in cam."""
+    rays = geometry_of(file).monitor.rays(x_px, y_px)
+    return np.asarray(rays[:, :2] / rays[:, 2:])

@@ -34,7 +34,7 @@ from hilstar.basics.pages import (
     value_text,
 )
 from hilstar.instruments.certify.model import THIRDS
-from hilstar.server.bench.certificate_file import Certificate, CertifiedFigure
+from hilstar.server.bench.certificate_file import ByTrials, Certificate, CertifiedFigure
 
 VERDICTS = {
     True: (OK, "Conforms"),
@@ -44,6 +44,12 @@ VERDICTS = {
 SHOWN = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency")
 FIRST = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "latency")
 BARS = ("flux", "place_along", "attitude_x", "star_flux")
+STATED = (
+    ("flux", "a star's flux"),
+    ("place_along", "its place"),
+    ("attitude_x", "attitude across"),
+    ("latency", "latency"),
+)
 MAX_BARS = 6
 MAX_APART = 20
 TWO_DIGITS = 2  # of a standard uncertainty
@@ -68,6 +74,8 @@ RULES = {
 }
 WORST_COLUMNS = ("quantity", "region", "value and U (95 %)", "k", "limit", "verdict")
 INPUT_COLUMNS = ("input", "distribution", "standard uncertainty", "unit", "dof", "source")
+BY_THIRD = ("flux", "place_along", "place_across")
+APART_COLUMNS = ("quantity", "of", "first order from", "to", "trials from", "to", "why")
 ALL_COLUMNS = ("quantity", "region", "HIP", "value and U (95 %)")
 MISSED_CURE = (
     "Mend the bench file's key or the bench where a figure is off, and certify again with --again."
@@ -110,9 +118,13 @@ def _size(figure: CertifiedFigure) -> float:
     return max(abs(figure.lower), abs(figure.upper))
 
 
+def _half_width(figure: CertifiedFigure) -> float:
+    return (figure.upper - figure.lower) / 2
+
+
 def _value(figure: CertifiedFigure) -> str:
     """A figure with the half width of its 95 % interval, to two digits of that."""
-    return measured(figure.value, (figure.upper - figure.lower) / 2, figure.unit)
+    return measured(figure.value, _half_width(figure), figure.unit)
 
 
 def _cards(found: Certificate, digest: str) -> Iterator[Card]:
@@ -178,21 +190,12 @@ def _budget(found: Certificate) -> Card:
 def statement(found: Certificate) -> str:
     """The statement of uncertainty, in a sentence or two."""
     parts = []
-    for quantity, quantity_text in (
-        ("flux", "a star's flux"),
-        ("place_along", "its place"),
-        ("attitude_x", "attitude across"),
-    ):
-        half = [
-            (figure.upper - figure.lower) / 2
-            for figure in found.figures
-            if figure.quantity == quantity
-        ]
-        unit = next((figure.unit for figure in found.figures if figure.quantity == quantity), "")
-        if half:
-            parts.append(f"{quantity_text} {np.sqrt(np.mean(np.square(half))):.2g} {unit}")
-    late = next((figure for figure in found.figures if figure.quantity == "latency"), None)
-    parts += [f"latency {(late.upper - late.lower) / 2:.2g} ms"] if late else []
+    for quantity, quantity_text in STATED:
+        members = [figure for figure in found.figures if figure.quantity == quantity]
+        if members:
+            half = np.array([_half_width(figure) for figure in members])
+            rms = float(np.sqrt((half**2).mean()))
+            parts.append(f"{quantity_text} {rms:.2g} {members[0].unit}")
     return (
         "Expanded uncertainty (95 %), rms over the reference stars:"
         f" {', '.join(parts) or 'nothing could be stated'}."
@@ -213,7 +216,8 @@ def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, object]]:
     yield "decision rule", RULES[found.decision]
     if found.replaces:
         yield "replaces", found.replaces
-    yield "certificate.json", Markup(f"SHA-256 <code>{digest}</code>; signing it is the user's")
+    code = f"<code>{digest}</code>"
+    yield "certificate.json", Markup(f"SHA-256 {code}; signing it is the user's")
     yield "hilstar", found.hilstar
 
 
@@ -268,45 +272,39 @@ def _bars(found: Certificate, quantity: str) -> str:
 
 
 def _both_ways(found: Certificate) -> Iterator[str]:
-    both = [
-        figure
-        for figure in found.figures
-        if figure.by_trials is not None and figure.standard_uncertainty > 0
-    ]
+    both = [figure for figure in found.figures if figure.by_trials is not None]
+    both = [figure for figure in both if figure.standard_uncertainty > 0]
     if not both:
         return
-    ratio = np.array(
-        [
-            figure.by_trials.standard_uncertainty / figure.standard_uncertainty
-            for figure in both
-            if figure.by_trials
-        ]
-    )
+    ratio = np.array([_trials(figure).standard_uncertainty for figure in both])
+    ratio /= [figure.standard_uncertainty for figure in both]
+    stand = "the largest number of trials was reached"
     if found.two_digits_stand:
         stand = "two digits of every figure stand"
-    else:
-        stand = "the largest number of trials was reached"
     yield (
         f"<p>{found.trials} trials of the whole model ({stand}): their standard uncertainty is"
         f" {ratio.min():.3f} to {ratio.max():.3f} of first order's.</p>"
     )
-    apart = [figure for figure in both if figure.by_trials and figure.by_trials.differs]
-    rows = [
-        (words_of(e.quantity), e.star or e.region,
-         e.value - e.k * e.standard_uncertainty, e.value + e.k * e.standard_uncertainty,
-         e.by_trials.lower, e.by_trials.upper, e.by_trials.differs)
-        for e in apart[:MAX_APART] if e.by_trials
-    ]  # fmt: skip
-    if rows:
-        yield (
-            f"<p>{len(apart)} figures differ by more than 5 % of the interval; the certificate"
-            " states the trials'.</p>"
-        )
-        yield table_of(
-            rows, ("quantity", "of", "first order from", "to", "trials from", "to", "why")
-        )
-    else:
+    apart = [figure for figure in both if _trials(figure).differs]
+    if not apart:
         yield "<p>No interval differs by more than 5 %.</p>"
+        return
+    yield (
+        f"<p>{len(apart)} figures differ by more than 5 % of the interval; the certificate states"
+        " the trials'.</p>"
+    )
+    rows = []
+    for figure in apart[:MAX_APART]:
+        drawn = _trials(figure)
+        half = figure.k * figure.standard_uncertainty
+        ends = figure.value - half, figure.value + half, drawn.lower, drawn.upper
+        rows.append((words_of(figure.quantity), figure.star or figure.region, *ends, drawn.differs))
+    yield table_of(rows, APART_COLUMNS)
+
+
+def _trials(figure: CertifiedFigure) -> ByTrials:
+    assert figure.by_trials is not None
+    return figure.by_trials
 
 
 def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str, str]]:
@@ -317,30 +315,29 @@ def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str,
         ("uncertainty", statement(found)),
     ]
     for quantity in SHOWN:
-        for region in (*THIRDS, None):
-            members = [
-                e for e in found.figures if e.quantity == quantity and region in (None, e.region)
-            ]
-            if not members or (region is None) == (
-                quantity in ("flux", "place_along", "place_across")
-            ):
-                continue
-            widest = max(members, key=lambda e: max(abs(e.lower), abs(e.upper)))
-            half = (widest.upper - widest.lower) / 2
-            # two digits of the uncertainty
-            if half > 0:
-                places = max(1 - math.floor(math.log10(half)), 0)
-            else:
-                places = 4
-            value = f"{round(widest.value, places) + 0.0:+.{places}f}"
-            text = f"{value} +- {half:.{places}f} {widest.unit} (the worst of {len(members)})"
-            lines.append((f"{quantity} {region or ''}".strip(), text))
+        members = [figure for figure in found.figures if figure.quantity == quantity]
+        if quantity in BY_THIRD:
+            for region in THIRDS:
+                there = [figure for figure in members if figure.region == region]
+                lines += _worst_line(f"{quantity} {region}", there)
+        else:
+            lines += _worst_line(quantity, members)
     if found.cube is not None:
         lines.append(("cube to boresight", found.cube.line))
-    lines += [("not assessed", widest) for widest in found.not_assessed]
-    return [
-        *lines,
-        ("valid until", found.valid_until),
-        ("sha256", digest),
-        ("page", str(folder / "index.html")),
-    ]
+    lines += [("not assessed", reason) for reason in found.not_assessed]
+    lines.append(("valid until", found.valid_until))
+    lines.append(("sha256", digest))
+    return [*lines, ("page", str(folder / "index.html"))]
+
+
+def _worst_line(name: str, members: list[CertifiedFigure]) -> Iterator[tuple[str, str]]:
+    """A line of the worst of some figures, to two digits of its uncertainty; none without any."""
+    if not members:
+        return
+    worst = max(members, key=_size)
+    half = _half_width(worst)
+    places = 4
+    if half > 0:
+        places = max(1 - math.floor(math.log10(half)), 0)
+    value = f"{round(worst.value, places) + 0.0:+.{places}f}"
+    yield name, f"{value} +- {half:.{places}f} {worst.unit} (the worst of {len(members)})"

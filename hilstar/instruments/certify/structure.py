@@ -5,14 +5,15 @@ A fit's residuals are noise, of each reading by itself, and perhaps a part whose
 with distance: as
 exp(-d^2 / 2 L^2) in place, as exp(-t / T) in time. Ratio of the variances and length are those of a
 grid, each by its restricted likelihood (Patterson and Thompson 1971), which takes the fit's own
-terms out. All points of the grid count by their likelihood: a structure whose length is unsure is
-so in what it does. Where none is more likely, there is none.
+terms out. All points of the grid count by their likelihood, and so does it that there is none: a
+structure that is unsure is so in what it does.
 
 In place readings are averaged over cells of a lattice, whose correlations are products of rows and
 columns, so that one grid of ratios costs no more than the squares of a few terms.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ ENOUGH, MIN_CELLS = 0.97, 64
 MIN_FILLED = 0.5  # relative to a full cell: a cell with fewer readings is taken as empty
 TINY = 1e-300
 MIN_DOF = 3.0
+UNLIKELY = 0.01  # less likely structure is none
 # steps between which the likelihood, which is smooth, is interpolated
 FINE_LENGTH, FINE_RATIO = 1.08, 1.12
 
@@ -52,6 +54,12 @@ class Structure:
         """The variance of the structure."""
         return float(self.variance.sum())
 
+    def parts(self) -> Iterator[tuple[float, float]]:
+        """Length and variance of each part of the structure that has one."""
+        for length, variance in zip(self.length, self.variance, strict=True):
+            if variance:
+                yield float(length), float(variance)
+
     @property
     def mean_length(self) -> float:
         """The mean of the lengths by their variances."""
@@ -61,78 +69,82 @@ class Structure:
 @dataclass(frozen=True, slots=True)
 class Spread:
     """Residuals in the basis in which their correlation is diagonal: values (m,) and terms (m, p),
-    in one reading's noise.
+    in one reading's noise, and the correlation's eigenvalues (m,) relative to that noise.
 
     `square` and `dof` are what is known of the noise beside them.
     """
 
+    eigen: FloatArray
     value: FloatArray
     terms: FloatArray
     square: float = 0.0
     dof: float = 0.0
 
+    def likelihood(self, ratio: float) -> tuple[float, float]:
+        """The logarithm of the restricted likelihood of a ratio of variances, and the noise's
+        variance by it.
+        """
+        weight = 1 / (1 + ratio * self.eigen)
+        weighted = weight[:, None] * self.terms
+        normal = self.terms.T @ weighted
+        towards = weighted.T @ self.value
+        explained = towards @ np.linalg.solve(normal, towards)
+        total = self.value @ (weight * self.value)
+        unexplained = float(total - explained) + self.square
+        dof = len(self.value) - self.terms.shape[1] + self.dof
+        _, log_of_normal = np.linalg.slogdet(normal)
+        sizes = float(log_of_normal - np.log(weight).sum())
+        of_noise = dof * math.log(max(unexplained, TINY))
+        return -0.5 * (sizes + of_noise), unexplained / dof
 
-def weighed(lengths: FloatArray, spreads: list[tuple[FloatArray, Spread]]) -> Structure:
-    """The structure by spreads at each length, each with its eigenvalues (m,) of correlation
-    relative to the noise's.
-    """
-    likelihood = np.zeros((len(lengths), len(RATIOS) + 1))
+
+def weighed(lengths: FloatArray, spreads: list[Spread]) -> Structure:
+    """The structure by spreads at each length."""
+    likelihood = np.zeros((len(lengths), len(RATIOS)))
     noise = np.zeros_like(likelihood)
-    ratios = np.append(0.0, RATIOS)
-    for row, (eigen, spread) in enumerate(spreads):
-        dof = len(spread.value) - spread.terms.shape[1] + spread.dof
-        for column, ratio in enumerate(ratios):
-            weight = 1 / (1 + ratio * eigen)
-            normal = spread.terms.T @ (weight[:, None] * spread.terms)
-            towards = spread.terms.T @ (weight * spread.value)
-            unexplained = (
-                float(
-                    spread.value @ (weight * spread.value)
-                    - towards @ np.linalg.solve(normal, towards)
-                )
-                + spread.square
-            )
-            sizes = float(np.linalg.slogdet(normal)[1] - np.log(weight).sum())
-            likelihood[row, column] = -0.5 * (sizes + dof * math.log(max(unexplained, TINY)))
-            noise[row, column] = unexplained / dof
+    for row, spread in enumerate(spreads):
+        for column, ratio in enumerate(RATIOS):
+            likelihood[row, column], noise[row, column] = spread.likelihood(ratio)
+    none, noise_of_none = spreads[0].likelihood(0.0)  # the same for all lengths
     finer = _finer(lengths, FINE_LENGTH), _finer(RATIOS, FINE_RATIO)
-    of_some = _between(lengths, likelihood[:, 1:], finer)
-    noise_of_some = np.exp(_between(lengths, np.log(np.maximum(noise[:, 1:], TINY)), finer))
-    none = likelihood[:, 0].mean()  # the same for all lengths
-    share = np.exp(of_some - max(float(of_some.max()), none))
+    of_some = _between(lengths, likelihood, finer)
+    log_noise = np.log(np.maximum(noise, TINY))
+    noise_of_some = np.exp(_between(lengths, log_noise, finer))
+    largest = max(float(of_some.max()), none)
     # No structure and some are as likely beforehand; of some, each ratio and length.
-    share /= share.size
-    nothing = math.exp(none - max(float(of_some.max()), none))
-    if nothing >= float(share.sum()):
-        return Structure(lengths, np.zeros(len(lengths)), float(noise[0, 0]), math.inf)
-    share /= share.sum()
+    share = np.exp(of_some - largest) / of_some.size
+    some = float(share.sum())
+    likely = some / (some + math.exp(none - largest))
+    if likely < UNLIKELY:
+        return Structure(lengths, np.zeros(len(lengths)), noise_of_none, math.inf)
+    share /= some
     # As of a variance by few readings, whose Student's t has the geometric mean for its scale,
     # nearly.
     evidence = noise_of_some * finer[1]
     middle = float((share * np.log(evidence)).sum())
-    dof = max(2 / max(float((share * (np.log(evidence) - middle) ** 2).sum()), TINY), MIN_DOF)
+    scatter = float((share * (np.log(evidence) - middle) ** 2).sum())
     variance = (share * evidence).sum(axis=1)
-    return Structure(
-        finer[0],
-        variance * math.exp(middle) / variance.sum(),
-        float((share * noise_of_some).sum()),
-        dof,
-    )
+    # What the residuals hardly show may still move a fit: its variance counts by how likely it is.
+    variance *= likely * math.exp(middle) / variance.sum()
+    noise_variance = likely * float((share * noise_of_some).sum())
+    noise_variance += (1 - likely) * noise_of_none
+    dof = max(2 / max(scatter, TINY), MIN_DOF)
+    return Structure(finer[0], variance, noise_variance, dof)
 
 
 def _finer(values: FloatArray, step: float) -> FloatArray:
     """Values between the first and the last, by a smaller step."""
-    count = math.ceil(math.log(values[-1] / values[0]) / math.log(step)) + 1
-    return np.asarray(np.geomspace(values[0], values[-1], count))
+    first, last = values[0], values[-1]
+    steps = math.ceil(math.log(last / first) / math.log(step))
+    return np.geomspace(first, last, steps + 1)
 
 
 def _between(
     lengths: FloatArray, values: FloatArray, finer: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
     """Values (lengths, ratios), smooth in the logarithms of both, on a finer grid."""
-    spline = RectBivariateSpline(
-        np.log(lengths), np.log(RATIOS), values, kx=min(3, len(lengths) - 1), ky=3, s=0
-    )
+    degree = min(3, len(lengths) - 1)
+    spline = RectBivariateSpline(np.log(lengths), np.log(RATIOS), values, kx=degree, ky=3, s=0)
     return np.asarray(spline(np.log(finer[0]), np.log(finer[1])))
 
 
@@ -143,18 +155,25 @@ def in_time(t: FloatArray, value: FloatArray, terms: FloatArray) -> Structure:
     basis = np.linalg.qr(terms)[0]
     spreads = []
     for length in lengths:
-        eigen, vectors = np.linalg.eigh(np.exp(-np.abs(t[:, None] - t) / length))
-        spreads.append((np.maximum(eigen, 0.0), Spread(vectors.T @ value, vectors.T @ basis)))
+        eigen, vectors = _diagonal_in_time(t, length)
+        spreads.append(Spread(eigen, vectors.T @ value, vectors.T @ basis))
     return weighed(lengths, spreads)
 
 
-def lasting_root(t: FloatArray, found: Structure) -> FloatArray:
+def _diagonal_in_time(t: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (n,) and vectors (n, n) of the correlation of moments (n,)."""
+    apart = np.abs(t[:, None] - t)
+    eigen, vectors = np.linalg.eigh(np.exp(-apart / length))
+    return np.maximum(eigen, 0.0), vectors
+
+
+def lasting_root(t: FloatArray, structure: Structure) -> FloatArray:
     """A root (n, k) of the covariance of a structure in time at moments (n,)."""
-    if not found.total:
+    if not structure.total:
         return np.zeros((len(t), 0))
     apart = np.abs(t[:, None] - t)
     covariance = np.zeros((len(t), len(t)))
-    for length, variance in zip(found.length, found.variance, strict=True):
+    for length, variance in structure.parts():
         covariance += variance * np.exp(-apart / length)
     size, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(size, 0.0)))
@@ -172,35 +191,43 @@ class Cells:
         index = np.zeros(len(x_px), dtype=np.intp)
         for at in (y_px, x_px):
             places = np.unique(at)
+            step = 1.0
             if len(places) > 1:
                 step = float(np.median(np.diff(places)))
-            else:
-                step = 1.0
-            number = np.rint((at - places[0]) / step).astype(np.intp) // group
+            number = np.rint((at - places[0]) / step).astype(np.intp)
+            number //= group
             count = int(number.max()) + 1
-            self.middle.append(places[0] + step * (group * np.arange(count) + (group - 1) / 2))
+            first = places[0] + step * (group - 1) / 2
+            self.middle.append(first + step * group * np.arange(count))
             self.side.append(group * step)
             index = index * count + number
         self.index: IntArray = index
         self.size = len(self.middle[0]) * len(self.middle[1])
-        counts = np.bincount(index, minlength=self.size)
-        self.filled: BoolArray = counts >= MIN_FILLED * group**2
-        self.count = counts
-        self.typical = float(counts[self.filled].mean())
+        self.count = np.bincount(index, minlength=self.size)
+        self.filled: BoolArray = self.count >= MIN_FILLED * group**2
+        self.typical = float(self.count[self.filled].mean())
 
     def lengths(self) -> FloatArray:
-        """Lengths that the lattice can tell, px: from half of a cell to half of its extent."""
+        """Lengths that the lattice can tell, px: from half of a cell to a quarter of its extent.
+
+        Structure that is longer follows the terms of a fit, and no residual tells it.
+        """
         low = min(self.side) / 2
-        high = max(float(np.ptp(middles)) for middles in self.middle) / 2
-        return np.asarray(
-            np.geomspace(low, high, max(round(math.log(high / low) / math.log(LENGTH_STEP)) + 1, 2))
-        )
+        high = max(float(np.ptp(middles)) for middles in self.middle) / 4
+        steps = round(math.log(high / low) / math.log(LENGTH_STEP))
+        return np.geomspace(low, high, max(steps, 1) + 1)
 
     def means(self, values: FloatArray) -> FloatArray:
         """The means (cells, ...) of values (n, ...); 0 in empty cells."""
         sums = np.zeros((self.size, *values.shape[1:]))
         np.add.at(sums, self.index, values)
-        return np.asarray(sums / np.maximum(self.count, 1).reshape(-1, *[1] * (values.ndim - 1)))
+        count = np.maximum(self.count, 1)
+        means = sums.reshape(self.size, -1) / count[:, None]
+        return np.asarray(means.reshape(sums.shape))
+
+    def empty(self) -> FloatArray:
+        """A term of its own (cells, k) for each empty cell, which takes it out of a fit."""
+        return np.asarray(np.eye(self.size)[:, ~self.filled])
 
     def basis(self, length_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The correlation of cells' means: eigenvalues (cells,), and the vectors of rows and of
@@ -209,10 +236,8 @@ class Cells:
         parts = []
         for middle, side in zip(self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 6  # a mean over a cell: its own variance twice
-            between = (middle[:, None] - middle) ** 2
-            eigen, vectors = np.linalg.eigh(
-                length_px / math.sqrt(wide) * np.exp(-between / (2 * wide))
-            )
+            correlation = _falling(middle[:, None] - middle, wide)
+            eigen, vectors = np.linalg.eigh(length_px / math.sqrt(wide) * correlation)
             parts.append((np.maximum(eigen, 0.0), vectors))
         (down, rows), (along, columns) = parts
         return np.outer(down, along).ravel(), rows, columns
@@ -228,10 +253,16 @@ class Cells:
         parts = []
         for at, middle, side in zip((y_px, x_px), self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 12
-            parts.append(
-                length_px / math.sqrt(wide) * np.exp(-((at[:, None] - middle) ** 2) / (2 * wide))
-            )
-        return np.asarray((parts[0][:, :, None] * parts[1][:, None]).reshape(len(x_px), -1))
+            correlation = _falling(at[:, None] - middle, wide)
+            parts.append(length_px / math.sqrt(wide) * correlation)
+        down, along = parts
+        both = down[:, :, None] * along[:, None]
+        return np.asarray(both.reshape(len(x_px), -1))
+
+
+def _falling(apart_px: FloatArray, variance_px2: float) -> FloatArray:
+    """exp(-d^2 / 2 L^2) of distances, by the square of L."""
+    return np.asarray(np.exp(-(apart_px**2) / (2 * variance_px2)))
 
 
 def in_place(
@@ -242,37 +273,27 @@ def in_place(
     """
     inside = _rectangle(x_px, y_px)
     cells = Cells(x_px[inside], y_px[inside])
-    values = values[:, inside]
-    terms = terms[:, inside]
-    means = [cells.means(column) for column in values]
-    of_terms = [cells.means(column) for column in terms]
+    means = cells.means(values[:, inside].T)
+    of_terms = cells.means(terms[:, inside].transpose(1, 0, 2))
+    about_means = values[:, inside].T - means[cells.index]
+    within = float((about_means**2).sum())
+    more_readings = len(cells.index) - int((cells.count > 0).sum())
+    free = float(len(values) * more_readings)
     scale = math.sqrt(cells.typical)
-    within = float(
-        sum(
-            ((column - mean[cells.index]) ** 2).sum()
-            for column, mean in zip(values, means, strict=True)
-        )
-    )
-    free = float(len(values) * (len(cells.index) - (cells.count > 0).sum()))
-    empty = np.flatnonzero(~cells.filled)
-    hidden = np.zeros((cells.size, len(empty)))
-    # a term of its own takes an empty cell out of the fit
-    hidden[empty, np.arange(len(empty))] = 1.0
+    lengths = cells.lengths()
+    empty = cells.empty()
+    shape = of_terms.shape
     spreads = []
-    for length in (lengths := cells.lengths()):
+    for length in lengths:
         eigen, rows, columns = cells.basis(length)
-        own_turned = cells.turned(rows, columns, hidden)
-        blank = np.zeros_like(own_turned)
-        value = [scale * cells.turned(rows, columns, column[:, None])[:, 0] for column in means]
-        term = []
-        for axis, column in enumerate(of_terms):
-            alone = [own_turned if other == axis else blank for other in range(len(means))]
-            term.append(
-                np.concatenate([scale * cells.turned(rows, columns, column), *alone], axis=1)
-            )
-        basis = np.linalg.qr(np.concatenate(term))[0]
-        eigens = np.tile(cells.typical * eigen, len(means))
-        spreads.append((eigens, Spread(np.concatenate(value), basis, within, free)))
+        value = scale * cells.turned(rows, columns, means)
+        turned = scale * cells.turned(rows, columns, of_terms.reshape(cells.size, -1))
+        by_axis = turned.reshape(shape).transpose(1, 0, 2)
+        of_fit = by_axis.reshape(-1, shape[2])
+        hidden = np.kron(np.eye(len(values)), cells.turned(rows, columns, empty))
+        basis = np.linalg.qr(np.concatenate([of_fit, hidden], axis=1))[0]
+        eigens = np.tile(cells.typical * eigen, len(values))
+        spreads.append(Spread(eigens, value.T.ravel(), basis, within, free))
     return weighed(lengths, spreads)
 
 
@@ -282,19 +303,25 @@ def _rectangle(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
     """
     cells = Cells(x_px, y_px)
     filled = cells.filled.reshape(len(cells.middle[0]), len(cells.middle[1]))
-    low = [0, 0]
-    high = list(filled.shape)
-    while (
-        not (part := filled[low[0] : high[0], low[1] : high[1]]).mean() > ENOUGH
-        and part.size > MIN_CELLS
-    ):
-        edges = [
-            (float(np.take(part, end, axis=axis).mean()), axis, end)
-            for axis in (0, 1)
-            for end in (0, -1)
-        ]
-        _, axis, end = min(edges)
-        low[axis] += end == 0
-        high[axis] += end
-    row, column = np.divmod(cells.index, filled.shape[1])
-    return np.asarray((row >= low[0]) & (row < high[0]) & (column >= low[1]) & (column < high[1]))
+    height, width = filled.shape
+    rows = slice(0, height)
+    columns = slice(0, width)
+    while filled[rows, columns].mean() <= ENOUGH and filled[rows, columns].size > MIN_CELLS:
+        part = filled[rows, columns]
+        up = part[0].mean()
+        down = part[-1].mean()
+        at_left = part[:, 0].mean()
+        at_right = part[:, -1].mean()
+        emptiest = min(up, down, at_left, at_right)
+        if emptiest == down:
+            rows = slice(rows.start, rows.stop - 1)
+        elif emptiest == up:
+            rows = slice(rows.start + 1, rows.stop)
+        elif emptiest == at_right:
+            columns = slice(columns.start, columns.stop - 1)
+        else:
+            columns = slice(columns.start + 1, columns.stop)
+    row, column = np.divmod(cells.index, width)
+    in_rows = (row >= rows.start) & (row < rows.stop)
+    in_columns = (column >= columns.start) & (column < columns.stop)
+    return np.asarray(in_rows & in_columns)

@@ -484,7 +484,7 @@ CERTIFIED = (
 
 def certify_table() -> str:
     """How often certificates' intervals held the truth of planted benches, by kind and figure:
-    the mean over regions.
+    the mean over regions; blank where a kind does not move the figure.
     """
     rows = [row for row in rows_of("certify.csv") if row["held_percent"]]
     head, body = ["kind", "benches", *(name for name, _ in CERTIFIED)], []
@@ -493,6 +493,9 @@ def certify_table() -> str:
         cells = [kind, of_kind[0]["benches"]]
         for _, quantities in CERTIFIED:
             members = [row for row in of_kind if row["quantity"] in quantities]
+            if not members:
+                cells.append("")
+                continue
             held, low, high, ratio = (
                 sum(float(row[key]) for row in members) / len(members)
                 for key in ("held_percent", "low_percent", "high_percent", "ratio")

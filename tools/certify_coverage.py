@@ -1,8 +1,8 @@
 """Count how often certificates of planted benches hold the truth, and how long their intervals are.
 
 `python tools/certify_coverage.py BENCHES [KIND] [-o FILE.csv] [--seed S] [--levels N]`: all kinds,
-or one (`images` draws each image: 15 s a bench). A kind's rows in FILE.csv are replaced, those of
-others stay.
+or one (`images` draws each image: 6 s a bench). A kind's rows in FILE.csv are replaced, every five
+benches, and those of others stay.
 
 Each bench is drawn, and read, by code apart from certify's (tests/support/planted_readings.py), and
 certified as the command does by its readings. Only the figures that a kind moves are counted, as
@@ -27,6 +27,7 @@ from tests.support.planted_certify import (
     EXACT_LENS,
     LIGHT,
     PLACE,
+    After,
     Counted,
     coverage,
     coverage_by_images,
@@ -53,6 +54,8 @@ MOVED = {
     "warming up": (LIGHT,),
     "pixels that talk": (LIGHT,),
 }
+NAMES = [*KINDS, UNSTATED, IMAGES]
+WRITTEN_EVERY = 5  # benches, so that a run which is stopped has told something
 SIGMAS = 3.0
 COLUMNS = (
     "kind",
@@ -99,13 +102,15 @@ def rows_of(
     return rows
 
 
-def counted(kind: str, benches: int, seed: int, keys: str) -> dict[tuple[str, str], Counted]:
+def counted(
+    kind: str, benches: int, seed: int, keys: str, after: After
+) -> dict[tuple[str, str], Counted]:
     """Certify the benches of a kind, and count."""
     if kind == IMAGES:
-        return coverage_by_images(benches, seed)
+        return coverage_by_images(benches, seed, after)
     draw = KINDS[OWN_LENS if kind == UNSTATED else kind]
     tables = STATED.get(kind, EXACT_LENS)
-    return coverage(draw, benches, seed, keys, tables, MOVED.get(kind, ALL))
+    return coverage(draw, benches, seed, keys, tables, MOVED.get(kind, ALL), after)
 
 
 def written(path: Path) -> list[list[str]]:
@@ -116,20 +121,34 @@ def written(path: Path) -> list[list[str]]:
         return list(csv.reader(file))[1:]
 
 
+def write(path: Path | None, kind: str, rows: list[list[str]]) -> None:
+    """Put the rows of a kind into a file, in the place of those that it has; None: no file."""
+    if path is None:
+        return
+    rows = rows + [row for row in written(path) if row[0] != kind]
+    rows.sort(key=lambda row: NAMES.index(row[0]))
+    with path.open("w", newline="") as out:
+        csv.writer(out, lineterminator="\n").writerows([COLUMNS, *rows])
+
+
 def main() -> None:
     """Print the counts, and write them as CSV."""
-    names = [*KINDS, UNSTATED, IMAGES]
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("benches", type=int)
-    parser.add_argument("kind", nargs="?", choices=names)
+    parser.add_argument("kind", nargs="?", choices=NAMES)
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--levels", type=int, help="codes that are read")
     asked = parser.parse_args()
     keys = "" if asked.levels is None else f"levels = {asked.levels}\n"
-    for kind in [asked.kind] if asked.kind else [name for name in names if name != IMAGES]:
+    for kind in [asked.kind] if asked.kind else [name for name in NAMES if name != IMAGES]:
         started = time.process_time()
-        counts = counted(kind, asked.benches, asked.seed, keys)
+
+        def after(done: int, counts: dict[tuple[str, str], Counted], kind: str = kind) -> None:
+            if done % WRITTEN_EVERY == 0:
+                write(asked.output, kind, rows_of(kind, done, asked.seed, counts))
+
+        counts = counted(kind, asked.benches, asked.seed, keys, after)
         rows = rows_of(kind, asked.benches, asked.seed, counts)
         seconds = (time.process_time() - started) / asked.benches
         print(f"{kind}: {seconds:.2f} s of CPU a bench", flush=True)
@@ -139,11 +158,7 @@ def main() -> None:
                 f" assessed {row[4]}",
                 flush=True,
             )
-        if asked.output is not None:
-            rows += [row for row in written(asked.output) if row[0] != kind]
-            rows.sort(key=lambda row: names.index(row[0]))
-            with asked.output.open("w", newline="") as out:
-                csv.writer(out, lineterminator="\n").writerows([COLUMNS, *rows])
+        write(asked.output, kind, rows)
 
 
 if __name__ == "__main__":

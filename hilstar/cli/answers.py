@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from hilstar.server.answers.reader import ReadPlan
     from hilstar.server.bench.bench_file import BenchFile
 
+# how long a sender, and a page on this machine, may take to say what is shown
 SHOWN_WITHIN_S, PAGE_WITHIN_S = 2.0, 0.5
-MAX_STATE_BYTES = 1_000_000
+MAX_STATE_BYTES = 1_000_000  # of a page's state; another program at its port may say more
 MAX_ROWS = 100_000  # the newest, in the JSON object
 ROW_KEYS = ("t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "valid", "mode", "rms_arcsec", "centroids")
 
@@ -114,9 +115,10 @@ def _counts_line(counts: "Counter[str]") -> str:
 
 
 def _shown_now(file: "BenchFile") -> "FloatArray | None":
-    """What a run's page on this machine shows, or what the sender of the attitude says now.
+    """The attitude that is shown now, q_icrs_to_cam (4,): by a run's page on this machine, else by
+    the sender of [attitude].
 
-    None without a page, where that road has room for one listener only or nobody sends.
+    None without a page where the sender has room for one listener only, or sends nothing.
     """
     from hilstar.server.open_link import first_attitude, open_link
 
@@ -137,8 +139,8 @@ def _shown_now(file: "BenchFile") -> "FloatArray | None":
 
 
 def _shown_by_page() -> "FloatArray | None":
-    """The attitude of the newest frame of the run whose page is at the usual address; None where
-    there is none.
+    """The attitude of the newest frame, q_icrs_to_cam (4,), by the page at the usual address; None
+    where there is no page.
     """
     import http.client
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 from typer import Option
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.version import __version__
@@ -56,6 +56,9 @@ GROUPS = {
 }
 
 
+VERSION = "--version"
+
+
 class EarlyEnd(Exception):
     """Carries an EOFError through typer, which would take it for Ctrl-D, print an empty line and
     drop it.
@@ -84,6 +87,26 @@ class Commands(TyperGroup):
             raise EarlyEnd(error) from error
 
 
+class StatedOnce(TyperCommand):
+    """A command that refuses two values where an option takes one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words after the command's name. Raises InputError."""
+        if not ctx.resilient_parsing:  # Tab completes a wrong line, too
+            self._refuse_repeated(ctx, args)
+        return super().parse_args(ctx, args)
+
+    def _refuse_repeated(self, ctx: Any, args: list[str]) -> None:
+        """Refuse (InputError) a second value, of which typer would drop the first in silence."""
+        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        for parameter in self.params:
+            if not isinstance(parameter, TyperOption) or parameter.is_flag or parameter.multiple:
+                continue
+            count = given.count(parameter)
+            if count > 1:
+                raise InputError(f"{parameter.opts[0]}: is given {count} times; write it once")
+
+
 def print_version(wanted: bool) -> None:
     """Print the version and exit, if `wanted`."""
     if wanted:
@@ -94,9 +117,7 @@ def print_version(wanted: bool) -> None:
 def hilstar(
     _: Annotated[
         bool,
-        Option(
-            "--version", callback=print_version, is_eager=True, help="Print the version and quit."
-        ),
+        Option(VERSION, callback=print_version, is_eager=True, help="Print the version and quit."),
     ] = False,
 ) -> None:
     """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values
@@ -107,11 +128,11 @@ def hilstar(
 def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None:
     """Add the command of a function `name` in a file of this folder."""
     function = getattr(import_module(f"hilstar.cli.{file}"), name)
-    to.command(public(name), rich_help_panel=panel)(for_typer(function))
+    to.command(public(name), cls=StatedOnce, rich_help_panel=panel)(for_typer(function))
 
 
 def public(name: str) -> str:
-    """A function's name as a command's."""
+    """A command's name from its function's: first-light from first_light."""
     return name.strip("_").replace("_", "-")
 
 
@@ -131,8 +152,8 @@ def members(group: str) -> list[str]:
 
 @cache
 def application(only: str | None = None) -> typer.Typer:
-    """The commands of `hilstar`, or `only` the command or group of a name: each imports its
-    file, and all take 50 ms.
+    """The commands of `hilstar`; with `only`, that command or group alone, as importing all of them
+    takes 50 ms.
     """
     app = typer.Typer(
         cls=Commands,
@@ -156,7 +177,7 @@ def application(only: str | None = None) -> typer.Typer:
 
 @cache
 def built(only: str | None) -> Any:
-    """What typer makes of an application."""
+    """An application as typer runs it."""
     return typer.main.get_command(application(only))
 
 
@@ -169,4 +190,6 @@ def run(words: list[str]) -> Any:
     if not words or (len(words) == 1 and words[0] in GROUPS):
         run([*words, "--help"])
         return InputError.exit_code
-    return built(words[0] if words[0] in names() else None)(words, standalone_mode=False)
+    # the version needs no command, and an unknown word the names of all
+    only = words[0] if words[0] in (*names(), VERSION) else None
+    return built(only)(words, standalone_mode=False)

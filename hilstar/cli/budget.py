@@ -114,7 +114,9 @@ def star_noise(options: BudgetOptions, pointing: PlaceOptions) -> None:
 
 
 def with_its_figures(file: "benches.BenchFile", name: str) -> "benches.BenchFile":
-    """The bench with another sensor, and a line about where its figures are from."""
+    """The bench with the sensor of a name in place of its own; lines say what its sheet gives and
+    lacks. Raises InputError.
+    """
     from hilstar.basics.reading import parse_toml
     from hilstar.server.bench.bench_file import changed_file
     from hilstar.server.bench.config.sensor import lacking, named_keys, other_sensor

@@ -265,7 +265,7 @@ def focus(options: FocusOptions) -> None:
         raise InputError("give --grab CMD or a camera, or --virtual TRUTH.toml: one of them")
     file = read_bench_file(options.bench_file)
     check_files([options.virtual], [], file)
-    source_options = ImageOptions(grab=options.grab, virtual=options.virtual)
+    source_options = ImageOptions(grab=options.grab, virtual=options.virtual, dark=None, diode=None)
     stop = threading.Event()
     curve = FocusCurve()
     with (

@@ -48,7 +48,7 @@ class CaseOptions:
     )
 
     def processes(self) -> int:
-        """Their number on this machine."""
+        """The number of worker processes on this machine."""
         return self.workers or len(os.sched_getaffinity(0))
 
 
@@ -177,8 +177,8 @@ def check_through(
     of_bench: dict[str, bool],
     of_tracker: dict[str, bool],
 ) -> None:
-    """Refuse (InputError) options that mean nothing for the plan's `through`, which is written as
-    `setting` in a plan or in a command.
+    """Refuse (InputError) options that mean nothing for a plan's `through`; `setting` is how the
+    plan or the command writes it.
     """
     if on_bench:
         meaningless = of_tracker

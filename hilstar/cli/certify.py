@@ -139,7 +139,7 @@ def _certify(
 
 
 def _watched(file: "files.BenchFile", reader: "Reader", options: CertifyOptions) -> "WarmUp | None":
-    """The white of a monitor that warms up; None where nobody waits for that."""
+    """The warm-up of the monitor's white; None without --warm-up."""
     from hilstar.instruments.certify.check import watch
 
     if not options.warm_up:
@@ -208,8 +208,8 @@ def _figure_line(figure: "CheckFigure") -> str:
 def _reader(
     stack: ExitStack, file: "files.BenchFile", options: CertifyOptions, images: ImageOptions
 ) -> "Reader | None":
-    """Who reads the bench until `stack` ends; None without a camera and a virtual bench. Raises
-    InputError, MachineError.
+    """The reader of the bench, open until `stack` is closed; None without a camera and a virtual
+    bench. Raises InputError, MachineError.
     """
     from hilstar.instruments.certify.check import checks_in
     from hilstar.instruments.certify.readings import ImageReader, VirtualReader

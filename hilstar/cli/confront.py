@@ -10,7 +10,7 @@ from hilstar.cli.declare import argument, option, struct, switch
 from hilstar.cli.image_source import exposure_option, photographs
 from hilstar.cli.options import bench_argument, check_files, json_option, output_option
 from hilstar.cli.pointing import PointingOptions, optional_attitude
-from hilstar.server.console.terminal import print_found, say
+from hilstar.server.console.terminal import print_found, progress, say
 
 IMAGES, USUAL_COUNT = "images", 5
 
@@ -67,15 +67,17 @@ def confront(options: ConfrontOptions, pointing: PointingOptions) -> None:
     if not given:
         raise InputError("confront: no image; give files, or --grab to take them")
     tell = (lambda line: None) if options.as_json else typer.echo
-    confronted = confront_files(
-        options.bench_file,
-        given,
-        options.output,
-        start=start,
-        at_ns=at_ns,
-        fixed=options.fixed,
-        tell=tell,
-    )
+    with progress("confronting, percent", 100) as advance:
+        confronted = confront_files(
+            options.bench_file,
+            given,
+            options.output,
+            start=start,
+            at_ns=at_ns,
+            fixed=options.fixed,
+            tell=tell,
+            advance=advance,
+        )
     page = options.output / "index.html"
     print_found(options.as_json, confronted.figures, [*confronted.lines, f"page: {page}"])
     for note in (*confronted.notes, *confronted.failures):

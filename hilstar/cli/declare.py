@@ -18,12 +18,12 @@ from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
 from typer import Argument, Option
 
 Kind = TypeVar("Kind")
-WORDS = "words on the command line"  # key of a field's metadata
+DECLARATION = "declaration"  # key of a field's metadata
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
-    """What a field is on the command line: typer's `maker`, its flags, and its settings."""
+class Declaration:
+    """What typer is told of a field: its Option or Argument, its flags, and its settings."""
 
     maker: Callable[..., Any]
     flags: tuple[str, ...]
@@ -36,19 +36,19 @@ def option(value: str, meaning: str, *flags: str, default: Any = None, **setting
     `flags` come in place of the field's name; `settings` are typer's.
     """
     settings |= {"metavar": value or None, "help": meaning}
-    return field(default=default, metadata={WORDS: Words(Option, flags, settings)})
+    return field(default=default, metadata={DECLARATION: Declaration(Option, flags, settings)})
 
 
 def switch(meaning: str, *flags: str, **settings: Any) -> Any:
     """Declare an option without a value: False unless it is given."""
     settings["help"] = meaning
-    return field(default=False, metadata={WORDS: Words(Option, flags, settings)})
+    return field(default=False, metadata={DECLARATION: Declaration(Option, flags, settings)})
 
 
 def argument(value: str, meaning: str, *, default: Any = None, **settings: Any) -> Any:
     """Declare an argument, shown as `value` in the usage line."""
     settings |= {"metavar": value or None, "help": meaning}
-    return field(default=default, metadata={WORDS: Words(Argument, (), settings)})
+    return field(default=default, metadata={DECLARATION: Declaration(Argument, (), settings)})
 
 
 @dataclass_transform(
@@ -72,8 +72,8 @@ def for_typer(command: Callable[..., None]) -> Callable[..., None]:
     def flat(**values: Any) -> None:
         filled = {}
         for name, kind in structs.items():
-            names = [declared.name for declared in fields(kind)]
-            filled[name] = kind(**{field_name: values[field_name] for field_name in names})
+            of_kind = {declared.name: values[declared.name] for declared in fields(kind)}
+            filled[name] = kind(**of_kind)
         command(**filled)
 
     parameters = []
@@ -89,13 +89,13 @@ def for_typer(command: Callable[..., None]) -> Callable[..., None]:
 
 def _parameter(declared: "Field[Any]") -> Parameter:
     """A field as a parameter of typer's."""
-    words: Words = declared.metadata[WORDS]
-    flags = words.flags
-    if words.maker is Option and not flags:
+    declaration: Declaration = declared.metadata[DECLARATION]
+    flags = declaration.flags
+    if declaration.maker is Option and not flags:
         # typer's own name of a switch has a second one: --headless/--no-headless
         flags = (f"--{declared.name.replace('_', '-')}",)
     default = declared.default
     if default is None and type(None) not in get_args(declared.type):
         default = ...  # typer's sign of a required one
-    value = words.maker(default, *flags, **words.settings)
-    return Parameter(declared.name, Parameter.KEYWORD_ONLY, default=value, annotation=declared.type)
+    info = declaration.maker(default, *flags, **declaration.settings)
+    return Parameter(declared.name, Parameter.KEYWORD_ONLY, default=info, annotation=declared.type)

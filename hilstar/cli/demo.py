@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from hilstar.server.summary import RunSummary
 
 HZ = 60  # the demo bench's refresh
-USUAL_S, LOOP_S = 10.0, 60.0
+USUAL_S, LOOP_S = 10.0, 60.0  # of a run, and of one with a tracker, whose noise takes answers
 MAX_MISSED = 0.01  # share of frames from which the budget is no longer the tracker's alone
-FREE_PORT = "tcp://127.0.0.1:*"
+FREE_PORT = "tcp://127.0.0.1:*"  # ZeroMQ chooses it
 # the tracker of --loop
 BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01
 PLANTED = [
@@ -150,6 +150,9 @@ def _watching(
     advance: "FrameSink",
     tracker: "TrackerBeside | None",
 ) -> "Iterator[tuple[FrameSink, Outlet]]":
+    """The sink and the outlet of the demo's run, with its page and its tracker. Raises
+    MachineError where the GPU was lost.
+    """
     from hilstar.server.console.publisher import RunDescription
     from hilstar.server.record.ledger import NO_SPLIT
     from hilstar.server.serve import Outlet
@@ -252,9 +255,8 @@ class TrackerBeside:
         if self._process is None or self._feed is None:
             return False
         if self._process.poll() is not None:
-            error_lines = (
-                self._process.stderr.read().strip().splitlines() if self._process.stderr else []
-            ) or ["nothing"]
+            assert self._process.stderr is not None  # a pipe
+            error_lines = self._process.stderr.read().strip().splitlines() or ["nothing"]
             raise MachineError(
                 f"the demo's tracker ended before the run; it said: {error_lines[-1]}"
             )
@@ -276,32 +278,41 @@ class TrackerBeside:
             raise MachineError(f"the demo's run gives no budget: {refusal}") from refusal
         write_page(self._page, assessment)
         parts = assessment.found
-        rows: list[tuple[str, float, float | None, str]] = []
+        rows = []
         for k, axis in enumerate("xyz"):
-            rows.append(("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec"))
-        for name, planted, axes in (
+            bias_arcsec = float(parts.bias_arcsec[k])
+            rows.append(_LoopFigure(f"bias {axis}", BIAS_ARCSEC[k], bias_arcsec))
+        for name, planted_arcsec, axes in (
             ("field-of-view error", FOV_ARCSEC, parts.fov_arcsec),
             ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
         ):
-            rows += [
-                (f"{name} across", planted, axes.cross, "arcsec"),
-                (f"{name} about", ROLL * planted, axes.roll, "arcsec"),
-            ]
+            rows.append(_LoopFigure(f"{name} across", planted_arcsec, axes.cross))
+            rows.append(_LoopFigure(f"{name} about", ROLL * planted_arcsec, axes.roll))
         if isinstance(live, TrackerFigures) and live.answers:
-            rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
-        fields = {
-            "loop": [
-                {"quantity": name, "planted": a, "found": b, "unit": unit}
-                for name, a, b, unit in rows
-            ]
-        }
+            wrong_percent = 100 * live.wrong / live.answers
+            rows.append(_LoopFigure("wrong answers", 100 * WRONG, wrong_percent, "%"))
         if as_json:
-            say(json.dumps(fields))
+            say(json.dumps({"loop": [row._asdict() for row in rows]}))
             return
         for what, text in lines_of(assessment):
             typer.echo(f"{what:24}{text}")
         typer.echo(f"{'page':24}{self._page}")
         typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
-        for name, planted_value, value, unit in rows:
-            figure = "unknown" if value is None else f"{value:.2f}"
-            typer.echo(f"{name:28}{planted_value:10.2f}{figure:>10} {unit}")
+        for row in rows:
+            typer.echo(row.line())
+
+
+class _LoopFigure(NamedTuple):
+    """A figure of the demo's tracker: as it was planted, and as its budget has it."""
+
+    quantity: str
+    planted: float
+    found: float | None
+    unit: str = "arcsec"
+
+    def line(self) -> str:
+        """The figure as a row of a table."""
+        text = "unknown"
+        if self.found is not None:
+            text = f"{self.found:.2f}"
+        return f"{self.quantity:28}{self.planted:10.2f}{text:>10} {self.unit}"

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from hilstar.server.bench import bench_file as files
     from hilstar.server.console.listener import PageListener
 
-PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
+PATCHES = 96  # readings of the response, where no person has to save each image
+WARM_UP_MIN = 30.0  # of a virtual bench, whose minutes pass at once
+FORCED = "forced"  # name of a line
+S_PER_MIN = 60.0
 MAX_AVERAGE = 1000  # images that verify averages
 
 
@@ -127,7 +130,7 @@ def first_light(options: FirstLightOptions, images: ImageOptions, page: ActingPa
             source,
             readings,
             watch,
-            watched_s=SECONDS * warm_up_min,
+            watched_s=S_PER_MIN * warm_up_min,
             frames=options.average or 0,
             progress=say,
         )

@@ -101,5 +101,6 @@ def build(folder: Path, address: str) -> Path:
 
 
 def _forget_modules() -> None:
+    """Have the next import of the FMU's modules read their files: another FMU has others."""
     for name in (MODEL, PROTOCOL):
         sys.modules.pop(name, None)

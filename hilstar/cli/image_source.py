@@ -1,5 +1,4 @@
-"""The options that say where images of a tracker come from: by hand, a command, a camera, a virtual
-bench."""
+"""Where images of a tracker come from: a person, a command, a camera, or a virtual bench."""
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

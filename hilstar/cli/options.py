@@ -159,8 +159,8 @@ def check_files(
 
 
 def with_values(words: list[str]) -> list[str]:
-    """The command line with a share after each fault option that stands alone, an address after
-    --console, --darks for each.
+    """The command line with the values that may be left out: a share after a fault option, and an
+    address after --console, --scpi and --camera. --darks stands before each of its files.
     """
     complete: list[str] = []
     several = False  # --darks takes files up to the next option
@@ -221,15 +221,16 @@ def parse_resolution(text: str, example: str = "1920,1080") -> tuple[int, int]:
 
 
 def parse_spin(text: str) -> "FloatArray":
-    """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
+    """The rate in rad/s, cam components (3,), from "AXIS,DEG_PER_S". Raises InputError."""
     import numpy as np
 
     *axis, rate_text = [part.strip() for part in text.split(",")]
     try:
         rate = math.radians(float(rate_text))
-        vector = np.array(
-            SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis]
-        )
+        if len(axis) == 1:
+            vector = np.array(SPIN_AXES[axis[0].lower()])
+        else:
+            vector = np.array([float(part) for part in axis])
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
     length = math.hypot(*vector)
@@ -369,7 +370,7 @@ def parse_diode(text: str) -> tuple[str, int]:
 
 
 def parse_share(text: str, option: str) -> float:
-    """A share from "5%" or "0.05". Raises InputError."""
+    """A fraction, 0 to 1, from "5%" or "0.05". Raises InputError."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
     if match:
         share = float(match[1]) / (100.0 if match[2] else 1.0)
@@ -395,7 +396,7 @@ def parse_speed(text: str) -> float:
 
 
 def parse_split(text: str | None) -> "SplitLimits":
-    """The split of "1GB" or "1h". Raises InputError."""
+    """The size or time at which a ledger is split, from "1GB" or "1h". Raises InputError."""
     from hilstar.server.record.ledger import NO_SPLIT, SplitLimits
 
     if text is None:
@@ -413,7 +414,7 @@ def parse_split(text: str | None) -> "SplitLimits":
 
 
 def parse_memory(text: str) -> int:
-    """The bytes of "4GB" or "500 MB". Raises InputError."""
+    """Bytes, from "4GB" or "500 MB". Raises InputError."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(MB|GB)", text.strip())
     if match is None or float(match[1]) <= 0:
         raise InputError(f"--memory {text}: write a size such as 4GB or 500MB")

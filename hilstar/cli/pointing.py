@@ -37,7 +37,9 @@ class PointingOptions(PlaceOptions):
 
     @property
     def given(self) -> list[str]:
-        """The texts that the command line gives, one at most where it is right."""
+        """The attitudes that the command line states, as texts; `attitude_of` refuses more than
+        one.
+        """
         texts = (self.radec, self.star, self.quaternion)
         return [text for text in texts if text is not None]
 
@@ -136,6 +138,7 @@ def _star_named(text: str) -> str:
 
 
 def _is_number(text: str) -> bool:
+    """Whether an angle is a number of degrees."""
     try:
         float(text)
     except ValueError:

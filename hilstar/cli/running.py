@@ -60,7 +60,7 @@ class DisplayOptions:
     feed: str | None = feed_option()
 
     def given(self) -> dict[str, bool]:
-        """Which of them the command line gives."""
+        """Each flag, and whether the command line gives it."""
         return {
             "--headless": self.headless,
             "--windowed": self.windowed,
@@ -71,7 +71,7 @@ class DisplayOptions:
 
 @struct
 class RunOptions:
-    """What a run takes with it beside the attitudes, what it records, and what it says of it."""
+    """What a run records, which faults it has, and what it prints."""
 
     ledger: Path | None = option(
         "RUN.mcap",
@@ -118,8 +118,8 @@ class ActingPageOptions(PageOptions):
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
-    """Explain the attitudes' source, that of the stars, the choices within the tolerance, and
-    bodies that are discs then.
+    """Say what was chosen for this scene and why: the sources of attitudes and stars, the choices
+    within the tolerance, and the bodies that are discs at `t_ns`.
     """
     from hilstar.optics.layers.diffuse_layer import DiffuseLayer
     from hilstar.server.bench.effort_report import effort_lines
@@ -179,7 +179,7 @@ def shown_bench(
 
 
 def forced_on(screen: Any) -> str:
-    """What is wrong with a screen that is shown by --force; "" for nothing, and headless."""
+    """The faults of a screen that --force ignores; "" for none, and headless."""
     return "" if screen is None else "; ".join(screen.forced)
 
 
@@ -193,8 +193,8 @@ def say_of_light(bench: Any) -> None:
 
 
 def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
-    """Warn of a length in the bench file that is probably in another unit than its key; else of
-    a star that is too wide.
+    """Warn where a length of the bench file is probably in another unit than its key, else where a
+    star is too wide.
     """
     fault = star.fault()
     if fields.warning is not None:
@@ -204,8 +204,8 @@ def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
 
 
 def say_seen(bench: Any) -> dict[str, Any]:
-    """Say what screen and tracker see and how wide a star is then, with what is wrong of it;
-    both for the run's summary.
+    """Say the fields of view of screen and tracker and the width of a star, with a warning where
+    one is implausible. Returns both for the run's summary.
     """
     from hilstar.server.bench.cameras import fields_of_view
     from hilstar.server.bench.star_size import star_size
@@ -219,8 +219,8 @@ def say_seen(bench: Any) -> dict[str, Any]:
 
 
 def say_units_of(file: "BenchFile") -> None:
-    """Warn of a length of a bench file that is probably another quantity, or in another unit
-    than its key.
+    """Warn where a length of a bench file is probably another quantity, or in another unit than its
+    key.
     """
     from hilstar.server.bench.cameras import fields_of_view
 
@@ -228,7 +228,7 @@ def say_units_of(file: "BenchFile") -> None:
 
 
 def say_units(fields: "FieldsOfView") -> None:
-    """The same, of fields of view that are at hand."""
+    """The same warning, from fields of view that were found already."""
     if fields.warning is not None:
         say(f"check the units: {fields.warning}")
 
@@ -507,10 +507,13 @@ def followed(
     frames: "FrameFeed | None" = None,
     scpi: "PageListener | None" = None,
 ) -> "Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]":
-    """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its
-    follower, their requests.
+    """Connect a run to all that follows it: terminal, `record`, systemd, `frames`, page and SCPI.
+
+    Yields the sink of its frames, its follower, and the requests of page and SCPI.
     """
-    sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
+    sinks: list[FrameSink] = [status.see]
+    if record is not None:
+        sinks.insert(0, record)
     if frames is not None:
         sinks.append(frames.see)
     with (
@@ -536,6 +539,7 @@ def followed(
 
 
 def _all_of(sinks: "list[FrameSink]") -> "FrameSink":
+    """A sink that hands each frame to all of `sinks`, in their order."""
     if len(sinks) == 1:
         return sinks[0]
 

@@ -125,8 +125,8 @@ def send(options: SendOptions, pointing: PlaceOptions, statements: LogStatements
 
 
 def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
-    """`advance`, which keeps this process prompt, too: it stands for another machine, which no
-    display here delays.
+    """`advance`, which also keeps this process prompt: the sender stands for another machine, which
+    a display here does not delay.
     """
     if not is_command():
         return advance
@@ -207,7 +207,9 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
 
 
 def heard(sender: Any, wait_s: float, stop: threading.Event, waited: Callable[[int], None]) -> bool:
-    """True once a receiver listens, and when stopped, which then ends the sending at once."""
+    """Whether a receiver listens within `wait_s`; True, too, once the sender is stopped, which then
+    ends at once.
+    """
     started_s = time.monotonic()
     deadline_s = started_s + wait_s
     while not stop.is_set():

@@ -48,11 +48,12 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
 
     heads = asked.heads
     if asked.ledger is not None and not overwrite:
-        taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
-        if taken:
-            raise InputError(
-                f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite"
-            )
+        for name in heads.names:
+            file = head_ledger(asked.ledger, name)
+            if file.exists():
+                raise InputError(
+                    f"--ledger {asked.ledger}: {file} exists; give another name, or --overwrite"
+                )
     notices = Notices()
     asked = replace(asked, consoles=_consoles(console, asked.token, len(heads.names)))
     with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
@@ -60,35 +61,39 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not link.steps  # read_heads refuses lockstep
         head_summaries = run_heads(asked, link, say)
-    lines = []
-    verdicts = []
+    lines = [_head_line(name, head) for name, head in head_summaries.items()]
     for name, head in head_summaries.items():
         summary = head["summary"]
-        if isinstance(summary, dict):
-            frames = summary.get("frames")
-        else:
-            frames = None
-        if frames is None:
-            counted = "no summary"
-        else:
-            counted = f"{frames} frames"
-        if head["restarts"]:
-            again = f", started again {head['restarts']} times"
-        else:
-            again = ""
-        lines.append(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
         if isinstance(summary, dict) and "verdict" in summary:
-            verdicts.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
-    print_found(as_json, {"heads": head_summaries}, [*lines, *verdicts])
+            lines.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
+    print_found(as_json, {"heads": head_summaries}, lines)
     codes = [head["exit_code"] for head in head_summaries.values()]
     if all(code == NO_ATTITUDE for code in codes):
         raise typer.Exit(NO_ATTITUDE)
-    failed = [code for code in codes if code not in {0, NO_ATTITUDE}]
-    if failed:
-        raise typer.Exit(failed[0] if 0 < failed[0] <= NO_ATTITUDE else 1)
+    failures = [code for code in codes if code not in {0, NO_ATTITUDE}]
+    if failures:
+        # a head that a signal ended has a negative code, which is none of a command's
+        raise typer.Exit(failures[0] if 0 < failures[0] <= NO_ATTITUDE else 1)
+
+
+def _head_line(name: str, head: dict[str, Any]) -> str:
+    """How a head's process ended; its summary is a text where it printed no JSON object."""
+    frames = None
+    if isinstance(head["summary"], dict):
+        frames = head["summary"].get("frames")
+    count = "no summary"
+    if frames is not None:
+        count = f"{frames} frames"
+    restarts = ""
+    if head["restarts"]:
+        restarts = f", started again {head['restarts']} times"
+    return f"{name:20s}{count}, exit code {head['exit_code']}{restarts}"
 
 
 def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, ...]:
+    """The addresses of the heads' pages, one port after another; none without --console. Raises
+    InputError where one of them cannot be had.
+    """
     from hilstar.server.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
     if console is None:
@@ -98,16 +103,16 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
         raise InputError(
             f"--console {console}: {count} pages need as many ports from there; choose a lower one"
         )
-    addresses = []
-    for k in range(count):
-        addresses.append(ListenAddress(first.host, first.port + k if first.port else 0))
-    with ExitStack() as doors:
+    ports = [0] * count  # of the system's choice
+    if first.port:
+        ports = [first.port + k for k in range(count)]
+    addresses = [ListenAddress(first.host, port) for port in ports]
+    with ExitStack() as stack:
         for address in addresses:
-            doors.enter_context(PageListener(address, token))
-    if ":" in first.host:
-        host = f"[{first.host}]"
-    else:
-        host = first.host
+            stack.enter_context(PageListener(address, token))
+    host = first.host
+    if ":" in host:
+        host = f"[{host}]"
     return tuple(f"{host}:{address.port}" for address in addresses)
 
 
@@ -152,7 +157,7 @@ class ServeOptions:
 
 @struct
 class HeadOptions:
-    """What the process of several heads gives that of one head."""
+    """What `serve` of several heads gives the process of one head."""
 
     head_of: Path | None = option("", "The file with `heads`.", hidden=True)
     fed_by: str | None = option("", "The endpoint of the source's attitudes.", hidden=True)
@@ -267,8 +272,8 @@ def heads_run(
     run: RunOptions,
     page: ActingPageOptions,
 ) -> "HeadsRun":
-    """A run of several heads, whose processes get the options that each can take. Raises InputError
-    for those of one bench.
+    """The run of several heads, with the options that go to each head's process. Raises InputError
+    for options of one bench.
     """
     from hilstar.server.heads import HeadsRun
 
@@ -306,9 +311,7 @@ def heads_run(
 
 
 def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
-    """The run as its page says it; where SCPI steers, with the port of the link to which it
-    sends.
-    """
+    """What the page says of the run; where SCPI steers, also the port to which SCPI sends."""
     from hilstar.server.console.publisher import RunDescription
 
     source = file.config.attitude

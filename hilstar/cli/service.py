@@ -24,7 +24,7 @@ from hilstar.server.console.terminal import print_found, print_json, say
 if TYPE_CHECKING:
     from hilstar.server.console.listener import ListenAddress
 
-TOKEN_BYTES = 32
+TOKEN_BYTES = 32  # as many as `secrets` itself takes by default
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 DISPLAY_VARIABLES = ("DISPLAY", "XAUTHORITY", "WAYLAND_DISPLAY")
 
@@ -159,7 +159,9 @@ def _make_token(path: Path) -> None:
 
 
 def _bare_name(name: str) -> str:
-    """A service's name without what a unit or a bench file adds to it."""
+    """A service's name without the ending and the prefix of its unit, or the ending of its bench
+    file.
+    """
     return name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
 
 
@@ -199,7 +201,7 @@ def uninstall(options: UninstallOptions) -> None:
 
 
 def _systemctl(*words: str) -> bool:
-    """Whether this user's systemd did it."""
+    """Run systemctl for this user. Returns whether it succeeded."""
     command = ["systemctl", "--user", *words]
     try:
         done = subprocess.run(command, capture_output=True, timeout=SYSTEMD_S, check=False)

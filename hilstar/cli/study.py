@@ -156,9 +156,7 @@ def chain_study(
 def thesis_lines(
     what: str, bench: Path, output: Path, place: tuple[float, float, float] | None
 ) -> list[str]:
-    """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a
-    place; what it found.
-    """
+    """The findings of `models` or `outputs` for a bench, in the thesis's fields and at a place."""
     from hilstar.instruments.study import outputs, rapp
     from hilstar.instruments.study.fields import fields_of
     from hilstar.server.bench.bench_file import read_bench_file
@@ -176,8 +174,8 @@ def thesis_lines(
 
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:
-    """Run a study; what it found, and whether everything was right (None: its times cannot be
-    judged).
+    """The findings of a study, and whether all was right; None where its times cannot be judged on
+    a busy machine.
     """
     make_directory(output)
     module = what

@@ -15,6 +15,7 @@ import typer
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import is_command, stop_on_signal
+from hilstar.basics.units import NS_PER_S
 from hilstar.cli.completion import offered
 from hilstar.cli.declare import option, struct, switch
 from hilstar.cli.options import (
@@ -39,8 +40,9 @@ if TYPE_CHECKING:
     from hilstar.server.gige.camera import GigECamera
 
 SOLVER_S = 10.0  # for a command
-NICE = 5
+NICE = 5  # behind a display on this machine, which has 0
 MAX_RATE_HZ, USUAL_RATE_HZ = 1000.0, 10.0
+# of planted errors: more than any tracker's, and arithmetic still holds them
 MAX_ARCSEC, MAX_S, MAX_PPM = 1e5, 1e5, 1e4
 SILENT = re.compile(r"(\d+(?:\.\d*)?)s?(?:@(\d+(?:\.\d*)?)s?)?")
 PLANTED = "Errors to plant"  # a panel of the help
@@ -333,7 +335,9 @@ def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
 
 
 def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
-    """Who finds attitudes lost in space; None: the true one is taken. Raises InputError."""
+    """The solver of attitudes lost in space; None where the true attitude is taken. Raises
+    InputError.
+    """
     import numpy as np
 
     from hilstar.tracker.identify import LostInSpace
@@ -356,7 +360,12 @@ def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
         database = LostInSpace(
             vectors, stars.v_mag[: len(vectors)], camera.focal_length_px, camera.resolution_px
         )
-        return lambda found, dn: database.solve(found.rays[:, :2] / found.rays[:, 2:], found.flux_e)
+
+        def solve(stars: Any, dn: Any) -> Any:
+            on_plane = stars.rays[:, :2] / stars.rays[:, 2:]
+            return database.solve(on_plane, stars.flux_e)
+
+        return solve
     return by_image(text or "", live)
 
 
@@ -376,17 +385,19 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
         )
     solver = choose_solver(text, Centroiding(), live.file.folder, SOLVER_S)
     nowhere = View(np.array([1.0, 0.0, 0.0, 0.0]))
-    told_kinds = set[str]()
+    no_light = np.zeros((0, 0))
+    no_stars = np.zeros(0, dtype=EXPOSURE_DTYPE)
+    faults = set[str]()
 
-    def solve(found: Any, dn: Any) -> Any:
+    def solve(stars: Any, dn: Any) -> Any:
+        exposure = Exposure(nowhere, dn, no_light, no_stars)  # an image without its truth
         try:
-            return solver.solve(
-                Exposure(nowhere, dn, np.zeros((0, 0)), np.zeros(0, dtype=EXPOSURE_DTYPE)), live
-            ).q_icrs_to_cam
+            return solver.solve(exposure, live).q_icrs_to_cam
         except SolverFault as fault:
-            if str(fault) not in told_kinds:
+            # a solver fails at ten images a second, for one reason
+            if str(fault) not in faults:
                 say(f"hilstar: {fault}")
-                told_kinds.add(str(fault))
+                faults.add(str(fault))
             return None
 
     return solve
@@ -396,17 +407,18 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
 def recorded(path: Path | None) -> Iterator[Any]:
     """A function that writes an answer as a row of telemetry; it does nothing without a file."""
     if path is None:
-        yield lambda said: None
+        yield lambda answer: None
         return
     with path.open("w", encoding="ascii") as file:
         file.write("t_s,qw,qx,qy,qz,valid\n")
 
-        def row(said: "Answer") -> None:
-            q = said.q_icrs_to_cam
+        def row(answer: "Answer") -> None:
+            t_s = (answer.t_ns or 0) / NS_PER_S
+            q = answer.q_icrs_to_cam
             if q is None:
-                numbers = ",,,"
+                file.write(f"{t_s:.9f},,,,,0\n")
             else:
                 numbers = ",".join(repr(float(value)) for value in q)
-            file.write(f"{(said.t_ns or 0) / 1e9:.9f},{numbers},{int(q is not None)}\n")
+                file.write(f"{t_s:.9f},{numbers},1\n")
 
         yield row

@@ -8,6 +8,7 @@ field over the pixels. All three are closed forms from direction to pixel, which
 shift on a coarse grid.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -34,6 +35,7 @@ NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild le
 # In focal lengths, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10,
 # which is enough.
 NEWTON_DONE = 1e-13
+# tangents to either side of a direction, for its slopes; Newton's last step is under it
 SLOPE_STEP = 1e-6
 BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens
 WITHIN = 1 - 1e-12  # the lens, whatever rounding does
@@ -175,13 +177,13 @@ def ray_shifts(camera: "Camera") -> Float32Array:
     likewise. Where the lens has no direction the shift is 0.
     """
     width, height = camera.resolution_px
-    columns = np.linspace(-0.5, width - 0.5, -(-width // NODE_STEP_PX) + 1)
-    rows = np.linspace(-0.5, height - 0.5, -(-height // NODE_STEP_PX) + 1)
-    x_px, y_px = np.meshgrid(columns, rows)
-    u, v = camera.tangents(x_px.ravel(), y_px.ravel())
-    plain_u, plain_v = replace(camera, lens=None).tangents(x_px.ravel(), y_px.ravel())
+    columns = math.ceil(width / NODE_STEP_PX) + 1
+    rows = math.ceil(height / NODE_STEP_PX) + 1
+    x_px, y_px = camera.grid_px((columns, rows))
+    u, v = camera.tangents(x_px, y_px)
+    plain_u, plain_v = replace(camera, lens=None).tangents(x_px, y_px)
     shifts = np.stack([u - plain_u, v - plain_v], axis=-1)
-    by_node = shifts.reshape(len(rows), len(columns), 2)
+    by_node = shifts.reshape(rows, columns, 2)
     return np.nan_to_num(by_node).astype(np.float32)
 
 
@@ -192,6 +194,14 @@ class Slopes(NamedTuple):
     x_by_v: FloatArray
     y_by_u: FloatArray
     y_by_v: FloatArray
+
+    @property
+    def areas(self) -> FloatArray:
+        """How much of the image, px^2, an area of tangents covers, (n,); negative where it is
+        turned round.
+        """
+        a, b, c, d = self
+        return a * d - b * c
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,7 +232,9 @@ class Camera:
             y += self.principal_point_px[1]
             return x, y
         near = _over(1.0, z)
-        return self.places_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+        u = image_vectors[:, 0] * near
+        v = image_vectors[:, 1] * near
+        return self.places_px(u, v)
 
     def project_outward(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `project`, but beyond the lens on straight lines away from the image: a path may
@@ -231,14 +243,17 @@ class Camera:
         if self.lens is None:
             return self.project(image_vectors)
         near = _over(1.0, image_vectors[:, 2])
-        return self.places_outward_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+        u = image_vectors[:, 0] * near
+        v = image_vectors[:, 1] * near
+        return self.places_outward_px(u, v)
 
     def places_outward_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `places_px`, but beyond the lens on straight lines away from the image."""
         limit = np.inf
         if self.lens is not None:
             limit = self.lens.max_tangent * WITHIN
-        beyond = np.flatnonzero(u * u + v * v > limit**2)
+        radius2 = u * u + v * v
+        beyond = np.flatnonzero(radius2 > limit**2)
         if not len(beyond):
             return self.places_px(u, v)
         times = np.hypot(u[beyond], v[beyond]) / limit
@@ -248,8 +263,10 @@ class Camera:
         v[beyond] /= times
         x_px, y_px = self.places_px(u, v)
         centre_x, centre_y = self.principal_point_px
-        x_px[beyond] = centre_x + (x_px[beyond] - centre_x) * times
-        y_px[beyond] = centre_y + (y_px[beyond] - centre_y) * times
+        from_centre_x = x_px[beyond] - centre_x
+        from_centre_y = y_px[beyond] - centre_y
+        x_px[beyond] = centre_x + from_centre_x * times
+        y_px[beyond] = centre_y + from_centre_y * times
         return x_px, y_px
 
     @property
@@ -292,8 +309,9 @@ class Camera:
         for _ in range(NEWTON_ROUNDS):
             if not (size > NEWTON_DONE).any():
                 break
-            a, b, c, d = free.slopes(u, v)
-            area = a * d - b * c
+            slopes = free.slopes(u, v)
+            a, b, c, d = slopes
+            area = slopes.areas
             for _ in range(STEPS_A_ROUND):
                 x, y = free.places_px(u, v)
                 off_x = x - x_px
@@ -307,7 +325,8 @@ class Camera:
                 v = np.where(wild, np.nan, v - step_v)
                 if not (size > NEWTON_DONE).any():
                     break
-        converged = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
+        is_within = np.hypot(u, v) <= self.lens.max_tangent
+        converged = (size < SLOPE_STEP) & is_within
         return np.where(converged, u, np.nan), np.where(converged, v, np.nan)
 
     def slopes(self, u: FloatArray, v: FloatArray) -> Slopes:
@@ -333,9 +352,9 @@ class Camera:
     def pixel_sr(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The solid angles (n,), sr, of pixels (n,)."""
         u, v = self.tangents(x_px, y_px)
-        a, b, c, d = self.slopes(u, v)
-        px2_per_tangent2 = a * d - b * c
-        return np.asarray(1 / (px2_per_tangent2 * (1 + u * u + v * v) ** 1.5))
+        px2_per_tangent2 = self.slopes(u, v).areas
+        length2 = 1 + u * u + v * v
+        return np.asarray(1 / (px2_per_tangent2 * length2**1.5))
 
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
         """The fastest that a direction crosses the image at a rate (3,) of the camera in image
@@ -343,13 +362,15 @@ class Camera:
         """
         u, v = self.tangents(*self.grid_px(SPEED_PLACES))
         rays = np.stack([u, v, np.ones_like(u)], axis=-1)
-        step = -np.cross(rate_image_rad_s, rays)
-        du = step[..., 0] - u * step[..., 2]
-        dv = step[..., 1] - v * step[..., 2]
+        step_x, step_y, step_z = -np.cross(rate_image_rad_s, rays).T
+        du = step_x - u * step_z
+        dv = step_y - v * step_z
         if self.lens is None:
             return float(self.focal_length_px * np.hypot(du, dv).max())
         a, b, c, d = self.slopes(u, v)
-        speed_px_s = np.hypot(a * du + b * dv, c * du + d * dv)
+        dx_px = a * du + b * dv
+        dy_px = c * du + d * dv
+        speed_px_s = np.hypot(dx_px, dy_px)
         return float(np.nanmax(speed_px_s))
 
     def scales_px_rad(self) -> tuple[float, float]:
@@ -365,9 +386,12 @@ class Camera:
         along_x = a * u + b * v
         along_y = c * u + d * v
         wide = 1 + u * u + v * v
-        xx = wide * (a * a + b * b + along_x**2)
-        yy = wide * (c * c + d * d + along_y**2)
-        xy = wide * (a * c + b * d + along_x * along_y)
+        plain_xx = a * a + b * b
+        plain_yy = c * c + d * d
+        plain_xy = a * c + b * d
+        xx = wide * (plain_xx + along_x**2)
+        yy = wide * (plain_yy + along_y**2)
+        xy = wide * (plain_xy + along_x * along_y)
         middle = (xx + yy) / 2
         spread = np.hypot((xx - yy) / 2, xy)
         smallest = float(np.sqrt(np.nanmin(middle - spread)))
@@ -378,7 +402,9 @@ class Camera:
         """Places over the whole image, its edges among them: `count` to a row and a column, or
         (columns, rows).
         """
-        columns, rows = (count, count) if isinstance(count, int) else count
+        if isinstance(count, int):
+            count = (count, count)
+        columns, rows = count
         width, height = self.resolution_px
         across = np.linspace(-0.5, width - 0.5, columns)
         down = np.linspace(-0.5, height - 0.5, rows)
@@ -399,8 +425,10 @@ class Camera:
         """Whether places in pixels are on the image; not so at NaN."""
         width, height = self.resolution_px
         with np.errstate(invalid="ignore"):
-            across = np.abs(x_px - (width - 1) / 2) <= width / 2
-            down = np.abs(y_px - (height - 1) / 2) <= height / 2
+            off_x = np.abs(x_px - (width - 1) / 2)
+            off_y = np.abs(y_px - (height - 1) / 2)
+            across = off_x <= width / 2
+            down = off_y <= height / 2
         return np.asarray(across & down)
 
     def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:
@@ -417,7 +445,8 @@ class Camera:
         reach = float(np.tan(angle_rad)) - radius  # tangents grow fastest at the rim, and outward
         x, y, z = seen.T
         inside = z > 0
-        for along, (low, high) in zip((x, y), self._box(margin_px), strict=True):
+        box = self._box(margin_px)
+        for along, (low, high) in zip((x, y), box, strict=True):
             inside &= along >= (low - reach) * z
             inside &= along <= (high + reach) * z
         return np.flatnonzero(inside)
@@ -473,7 +502,8 @@ def linear_shares(size: int, count: int) -> FloatArray:
     """The share (size, count) of each place of `grid_px` in each pixel of a row: linear between
     neighbours.
     """
-    at = (np.arange(size) + 0.5) * (count - 1) / size
+    middles = np.arange(size) + 0.5
+    at = middles * (count - 1) / size
     distance = np.abs(at[:, None] - np.arange(count))
     return np.asarray(np.maximum(0.0, 1 - distance))
 
@@ -505,13 +535,16 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
         return camera
     free = replace(camera, lens=replace(lens, max_tangent=np.inf))
     width, height = camera.resolution_px
-    left, right = -0.5 - margin_px, width - 0.5 + margin_px
-    top, bottom = -0.5 - margin_px, height - 0.5 + margin_px
-    across = np.linspace(left, right, BORDER_PLACES)
-    down = np.linspace(top, bottom, BORDER_PLACES)
-    along_side = np.ones(BORDER_PLACES)
-    border_x = np.concatenate([across, across, along_side * left, along_side * right])
-    border_y = np.concatenate([along_side * top, along_side * bottom, down, down])
+    first = -0.5 - margin_px
+    right = width - 0.5 + margin_px
+    bottom = height - 0.5 + margin_px
+    across = np.linspace(first, right, BORDER_PLACES)
+    down = np.linspace(first, bottom, BORDER_PLACES)
+    at_first = np.full(BORDER_PLACES, first)
+    at_right = np.full(BORDER_PLACES, right)
+    at_bottom = np.full(BORDER_PLACES, bottom)
+    border_x = np.concatenate([across, across, at_first, at_right])
+    border_y = np.concatenate([at_first, at_bottom, down, down])
     u, v = free.tangents(border_x, border_y)
     farthest = np.nan_to_num(np.hypot(u, v), nan=np.inf).max()
     reach = min(float(farthest), lens.max_tangent)
@@ -529,8 +562,8 @@ def _folds(camera: Camera, reach: float) -> bool:
     side = np.linspace(-reach, reach, FOLD_PLACES)
     columns, rows = np.meshgrid(side, side)
     inside = np.hypot(columns, rows) <= reach
-    a, b, c, d = camera.slopes(columns[inside], rows[inside])
-    return not (a * d - b * c > 0).all()
+    slopes = camera.slopes(columns[inside], rows[inside])
+    return not (slopes.areas > 0).all()
 
 
 def _wide(tangents: FloatArray) -> tuple[float, float]:
@@ -542,5 +575,6 @@ def _wide(tangents: FloatArray) -> tuple[float, float]:
     low = float(tangents.min())
     high = float(tangents.max())
     if np.isfinite(low):
-        return (low - BOW * (high - low), high + BOW * (high - low))
+        bow = BOW * (high - low)
+        return low - bow, high + bow
     return ANY_TANGENT

@@ -40,12 +40,12 @@ MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
 # farther apart.
 MAX_PIECES = 20_000
 MAX_SPRITES = 2_000_000
-COARSER = 0.25
-MIN_COARSENESS = COARSER**3
+COARSER = 0.25  # of the nodes to a sigma, from one attempt to the next
+MIN_COARSENESS = COARSER**3  # after it a turn has too many sprites
 MIDDLE_S = np.zeros(1)
 AT_ONCE = Scan()
 MAX_ROWS_A_ROW = 0.5  # rows that a star may cross while one is read
-ROUNDS, SETTLED_S = 40, 1e-10
+ROUNDS, SETTLED_S = 40, 1e-10  # a round leaves up to MAX_ROWS_A_ROW of the error: 40 leave 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +68,12 @@ class Motion:
         A constant rate turns about one axis: Rodrigues' formula on the attitude in the middle.
         """
         speed = float(np.linalg.norm(self.rate_cam_rad_s))
-        x, y, z = self.rate_cam_rad_s / speed if speed else np.zeros(3)
+        x, y, z = self.rate_cam_rad_s / (speed or 1.0)
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         angle = -speed * seconds[:, None, None]
         # `cross` squared is what Rodrigues' formula has of the axis
-        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+        squared = cross @ cross
+        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * squared
         return np.asarray(camera.cam_to_image @ turn @ to_matrix(self.q_icrs_to_cam))
 
 
@@ -162,7 +163,9 @@ def smeared_sprites(
 
 @dataclass(frozen=True, slots=True)
 class _Smear:
-    """Stars smeared on one image."""
+    """How stars are smeared on an image: its camera and PSF, the nodes to a sigma of their paths,
+    and how its rows are exposed.
+    """
 
     stars: Stars
     camera: Camera

@@ -95,15 +95,18 @@ def swept_sprites(
     chords = Chords(np.stack([begin_x, end_x]), np.stack([begin_y, end_y]))
     # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the
     # turn.
-    bulge_px = paths.speed_rad_s * scan.hold_s * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    length_px = np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    bulge_px = paths.speed_rad_s * scan.hold_s * length_px
     # From the first light of the row where a path begins until the row where it ends is written
     # again: a star that falls by a share s of the rows that the panel lights meanwhile is overtaken
     # by the panel hold / (1 - s) after the first.
     span_s = np.zeros(len(late_s))
     if scan.hold_s:
-        share = (scan.late_s(end_x, end_y, camera.resolution_px) - late_s) / scan.hold_s
+        later_s = scan.late_s(end_x, end_y, camera.resolution_px) - late_s
+        share = later_s / scan.hold_s
         share = np.where(np.isfinite(share), share, 0.0)
-        span_s = scan.hold_s / (1 - np.clip(share, -MAX_TURN_FIELD, MAX_TURN_FIELD))
+        share = np.clip(share, -MAX_TURN_FIELD, MAX_TURN_FIELD)
+        span_s = scan.hold_s / (1 - share)
         chords = chords.to(span_s / scan.hold_s)
     # the part of each path, 0 to 1
     first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)

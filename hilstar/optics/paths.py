@@ -95,7 +95,8 @@ def nodes_of(counts: IntArray) -> Nodes:
     table = _node_table()
     path = np.repeat(np.arange(len(counts)), counts)
     begin = np.cumsum(counts) - counts
-    entry = np.arange(len(path)) + np.repeat(table.first[counts] - begin, counts)
+    to_entry = np.repeat(table.first[counts] - begin, counts)
+    entry = np.arange(len(path)) + to_entry
     return Nodes(path, table.places[entry], table.weights[entry] / 2)
 
 
@@ -128,7 +129,8 @@ class Paths:
         axis = np.array([x, y, z])
         # Component by component (3, n): several times faster than direction by direction.
         self._seen = np.ascontiguousarray(seen.T)
-        self._cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ self._seen
+        cross_with_axis = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        self._cross = cross_with_axis @ self._seen
         self._along = axis[:, None] * (axis @ self._seen)
 
     def __len__(self) -> int:
@@ -147,14 +149,18 @@ class Paths:
         NaN behind the camera.
         """
         seen = self._seen[:, star]
-        return self._places_px(seen, self._cross[:, star], self._along[:, star], seconds)
+        cross = self._cross[:, star]
+        along = self._along[:, star]
+        return self._places_px(seen, cross, along, seconds)
 
     def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN
         behind the camera.
         """
-        shape = len(seconds), len(self)
-        seen, cross, along = self._seen[:, None], self._cross[:, None], self._along[:, None]
+        shape = (len(seconds), len(self))
+        seen = self._seen[:, None]
+        cross = self._cross[:, None]
+        along = self._along[:, None]
         x_px, y_px = self._places_px(seen, cross, along, seconds)
         return x_px.reshape(shape), y_px.reshape(shape)
 
@@ -198,15 +204,15 @@ class Paths:
 
 @dataclass(frozen=True, slots=True)
 class Chords:
-    """The straight ways between the ends of n paths, px, (2, n) each: begin and end; NaN behind
-    the camera.
+    """Straight ways between the ends of n paths, px: x and y (2, n), begin and end; NaN behind the
+    camera.
     """
 
     x_px: FloatArray
     y_px: FloatArray
 
     def to(self, longer: FloatArray) -> "Chords":
-        """The same ways from their begins, so many times (n,) as long."""
+        """The chords with the same begins, each so many times (n,) as long."""
         x_begin, x_end = self.x_px
         y_begin, y_end = self.y_px
         x_px = np.stack([x_begin, x_begin + (x_end - x_begin) * longer])
@@ -274,12 +280,12 @@ def node_counts(
 
 
 class ShortPaths:
-    """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of
-    its places as `points`.
+    """Paths (n) that approximate those of `exact`, each within `half_s` of its own `middle_s` (n,):
+    polynomials through `points` of its places.
 
-    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature
-    are the path's too.
-    Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
+    The places are at the roots of a Chebyshev polynomial. With one point, slope and curvature of
+    the path come from a table of the lens. Paths are off by at most LIMIT_PX or LIMIT_SHARE where
+    `points_within` gave the number of points.
     """
 
     def __init__(self, exact: Paths, middle_s: FloatArray, half_s: float, points: int) -> None:
@@ -292,12 +298,14 @@ class ShortPaths:
             table = _lens_table(*_mapping(exact.camera))
             self._terms = table.along(*exact.tangents_at(middle_s, half_s))
             return
-        at = np.cos((np.arange(points) + 0.5) * (np.pi / points))
+        half_steps = np.arange(points) + 0.5
+        at = np.cos(half_steps * (np.pi / points))
         outward = exact.through(_beyond(exact.camera))
         x_px, y_px = outward.all_places_px(middle_s + half_s * at[:, None])
         places = np.stack([x_px, y_px], axis=1)
         powers = np.linalg.inv(np.vander(at, increasing=True))
-        self._terms = (powers @ places.reshape(points, -1)).reshape(places.shape)
+        terms = powers @ places.reshape(points, -1)
+        self._terms = terms.reshape(places.shape)
 
     def __len__(self) -> int:
         return self._count
@@ -321,11 +329,11 @@ class ShortPaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensTable:
-    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over
-    its box.
+    """Where a lens images tangents: a polynomial of second degree about each node of a grid over
+    the lens's box.
 
-    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and
-    vv / 2. On the image places are off by up to `off_px`.
+    `terms` (6, 2, nodes) are x and y, px: the place, its changes by a step along u and v, and its
+    bends by uu / 2, uv and vv / 2. On the image places are off by up to `off_px`.
     """
 
     first: FloatArray
@@ -357,12 +365,9 @@ class LensTable:
         by_u += uv * v + 2 * steep_u
         by_v += cross + 2 * steep_v
         first = by_u * first_u + by_v * first_v
-        second = (
-            by_u * bend_u
-            + by_v * bend_v
-            + (uu * first_u + uv * first_v) * first_u
-            + vv * (first_v * first_v)
-        )
+        second = by_u * bend_u + by_v * bend_v
+        second += (uu * first_u + uv * first_v) * first_u
+        second += vv * (first_v * first_v)
         return np.stack([place, first, second])
 
 
@@ -383,7 +388,8 @@ def _lens_table(
     camera = _beyond(Camera(size_px, focal_px, principal_px, np.eye(3), lens))
     low, high = np.clip(np.array(lens.box).T, -lens.max_tangent, lens.max_tangent)
     beside = BESIDE_TABLE * (high - low)
-    low, high = low - beside, high + beside
+    low = low - beside
+    high = high + beside
     width, height = high - low
     step = float(max(width, height)) / TABLE_STEPS
     # one more node at each end
@@ -398,12 +404,16 @@ def _lens_table(
     right = row[..., 2:]
     above = column[:, :-2]
     below = column[:, 2:]
-    slopes = (right - left) / 2, (below - above) / 2
-    cross = (at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]) / 4
-    bends = (left + right) / 2 - middle, cross, (above + below) / 2 - middle
-    terms = np.stack([middle, *slopes, *bends]).reshape(6, 2, -1)
-    table = LensTable(low[:, None], 1 / step, (len(across) - 2, len(down) - 2), terms)
-    between = np.stack([u.ravel(), v.ravel()]) + step / 2  # where a table of second degree is worst
+    by_u = (right - left) / 2
+    by_v = (below - above) / 2
+    half_uu = (left + right) / 2 - middle
+    half_vv = (above + below) / 2 - middle
+    corners = at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]
+    terms = np.stack([middle, by_u, by_v, half_uu, corners / 4, half_vv])
+    shape = (len(across) - 2, len(down) - 2)
+    table = LensTable(low[:, None], 1 / step, shape, terms.reshape(6, 2, -1))
+    nodes = np.stack([u.ravel(), v.ravel()])
+    between = nodes + step / 2  # where a table of second degree is worst
     interpolated, _, _ = table.along(between, *np.zeros((2, 2, 1)))
     exact = np.stack(camera.places_outward_px(*between))
     error_px = np.hypot(*(interpolated - exact))
@@ -412,8 +422,8 @@ def _lens_table(
 
 
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
-    """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle;
-    None where no few do.
+    """The fewest places through which a path is within LIMIT_PX or LIMIT_SHARE of the exact one,
+    for a camera that turns by twice that angle; None where none are enough.
     """
     for points, longest_rad in _longest_half_turns_rad(*_mapping(camera)):
         if 0 < half_turn_rad <= longest_rad:
@@ -423,7 +433,9 @@ def points_within(camera: Camera, half_turn_rad: float) -> int | None:
 
 @lru_cache(maxsize=16)
 def bend_px(camera: Camera) -> float:
-    """The farthest that a lens moves a direction from where a pinhole has it, on the image."""
+    """The largest distance on the image between where a lens and where a pinhole of its focal
+    length has a direction, px.
+    """
     if camera.lens is None:
         return 0.0
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
@@ -455,15 +467,16 @@ def _longest_half_turns_rad(
 
 
 def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
-    """The largest error on the image, about several axes, as a multiple of what it may be: of
-    paths that begin on the image.
+    """The largest error of short paths that begin on the image, as a multiple of what is allowed,
+    over turns about TRIED_AXES.
     """
     camera = _beyond(camera)
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
     directions = np.column_stack([u, v, np.ones_like(u)])[np.isfinite(u)]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     size = np.array(camera.resolution_px)[:, None, None]
-    middle_px, half_px = (size - 1) / 2, size / 2
+    middle_px = (size - 1) / 2
+    half_px = size / 2
     moment = np.ones(len(directions))
     worst = 0.0
     for axis in TRIED_AXES:

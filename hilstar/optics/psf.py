@@ -25,10 +25,9 @@ from hilstar.basics.image_files import ImageSizeError, opened_fits
 from hilstar.basics.reading import named_bytes
 
 # The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would
-# be enough for the
-# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the
-# cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a
-# tenth and cut 4e-5 mag.
+# be enough for the flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of
+# that is cut, at the cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the
+# front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 MAX_GAUSSIAN_PX = 100_000  # the largest footprint that is tried
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
@@ -37,6 +36,7 @@ SQRT2 = math.sqrt(2.0)
 # 4.4e-7 off.
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
+# distances that the polynomial is fitted to; rounds of Lawson's weights
 FIT_PLACES, FIT_ROUNDS = 120, 15
 BOUND_PLACES = 200  # along an axis, at which an upper bound is taken
 # The rational approximation of erf in shaders/shares.glsl, above and below the line, the highest
@@ -92,8 +92,8 @@ FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in it
 
 
 class ShareShader(NamedTuple):
-    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w,
-    channels).
+    """What shares.glsl needs of a PSF: lines to define before it, its uniforms by name, and its
+    table (h, w, channels), if it has one.
     """
 
     defines: tuple[str, ...]
@@ -102,10 +102,11 @@ class ShareShader(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far a share of light may lie from its star: an ellipse.
+    """The ellipse about a star within which a pixel of its footprint can get more than a share s of
+    its light.
 
-    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 /
-    `axes_px2[1]` under log(`factor` / s).
+    It is x^2 / `axes_px2[0]` + y^2 / `axes_px2[1]` < log(`factor` / s), with x and y from the star,
+    px.
     """
 
     axes_px2: tuple[float, float]
@@ -118,9 +119,8 @@ class Psf(ABC):
 
     `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum. One
     that does has an odd footprint and overrides `stamps_at`, `image` and `centroids_px`: those who
-    draw ask these.
-    A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths, or (n, L) of n
-    stars; `mean_shares` (L,) are those of light without a spectrum of its own.
+    draw ask these. A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths,
+    or (n, L) of n stars; `mean_shares` (L,) are those of light without a spectrum of its own.
     """
 
     by_place = False
@@ -323,10 +323,11 @@ class GaussianPsf(Psf):
     def stamps(
         self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
     ) -> Float32Array:
-        """Row by row the product of what each column and each row has."""
+        """See `Psf.stamps`: the share of each column times the share of each row."""
         from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
-        edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
+        first_edge = (side_px - 1) // 2 + 0.5
+        edges = np.arange(side_px + 1)[:, None] - first_edge
         fraction_x, fraction_y = fraction_px
         sigma_x, sigma_y = self.sigma_px
         across = np.diff(ndtr((edges - fraction_x) / sigma_x), axis=0)
@@ -340,7 +341,8 @@ class GaussianPsf(Psf):
         self, fraction_px: Float32Array, rates: Float32Array, side_px: int, footprint_px: int
     ) -> Float32Array:
         """In float32, along x and along y."""
-        offset_px = (np.arange(side_px, dtype=np.float32) - (side_px - 1) // 2)[:, None]
+        pixel = np.arange(side_px, dtype=np.float32) - (side_px - 1) // 2
+        offset_px = pixel[:, None]
         sigma_x, sigma_y = self.sigma_px
         across = shader_shares(offset_px - fraction_px[0], sigma_x, footprint_px)
         down = shader_shares(offset_px - fraction_px[1], sigma_y, footprint_px)
@@ -366,7 +368,7 @@ class GaussianPsf(Psf):
         return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """Axis by axis, from the complements of both edges."""
+        """See `Psf.cut_share`: axis by axis, from the complements of both edges."""
         inside = 1.0
         for sigma in self.sigma_px:
             beyond_near = math.erfc((size_px / 2 - 0.5) / (sigma * SQRT2))
@@ -375,7 +377,7 @@ class GaussianPsf(Psf):
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
-        """The share of a pixel beside the middle of an edge."""
+        """See `Psf.outside_share`: that of a pixel beside the middle of an edge."""
         sigma_x, sigma_y = self.sigma_px
         beyond_px = size_px / 2
         beside_x = pixel_share(beyond_px, sigma_x) * pixel_share(0.0, sigma_y)
@@ -500,21 +502,25 @@ class SampledPsf(Psf):
     @cached_property
     def width_px(self) -> tuple[float, float]:
         """Adaptive moments (Bernstein and Jarvis 2002), less a pixel's own variance."""
-        at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
+        at_px = self._offsets_px
         middle = np.zeros(2)
         variance = np.ones(2)
         # a Gaussian weight as wide as the PSF halves its variance and its distance
         for _ in range(WIDTH_ROUNDS):
             powers = at_px ** np.arange(3)[:, None]
-            across = powers * np.exp(-((at_px - middle[0]) ** 2) / (2 * variance[0]))
-            down = powers * np.exp(-((at_px - middle[1]) ** 2) / (2 * variance[1]))
+            from_middle_px = at_px - middle[:, None]
+            weight_x, weight_y = np.exp(-(from_middle_px**2) / (2 * variance[:, None]))
+            across = powers * weight_x
+            down = powers * weight_y
             sums = down @ self._table @ across.T  # powers of y, powers of x
             light = sums[0, 0]
             mean = np.array([sums[0, 1], sums[1, 0]]) / light
             mean_square = np.array([sums[0, 2], sums[2, 0]]) / light
-            variance = np.maximum(2 * (mean_square - mean**2), PIXEL_VARIANCE)
+            weighted_variance = mean_square - mean**2
+            variance = np.maximum(2 * weighted_variance, PIXEL_VARIANCE)
             middle = 2 * mean - middle
-        x, y = np.sqrt(np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)).tolist()
+        width_px2 = np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)
+        x, y = np.sqrt(width_px2).tolist()
         return x, y
 
     @cached_property
@@ -527,7 +533,8 @@ class SampledPsf(Psf):
         """Places of the table to a pixel, an even number."""
         side_steps = MAX_TABLE_SIDE // self.footprint_px
         fine_steps = min(FINE_STEPS_A_PX, 2 * MAX_TABLE_SIDE // self.footprint_px)
-        return min(MAX_STEPS_A_PX, max(fine_steps, side_steps)) // 2 * 2
+        steps = min(MAX_STEPS_A_PX, max(fine_steps, side_steps))
+        return steps // 2 * 2
 
     @cached_property
     def _table(self) -> Float32Array:
@@ -541,10 +548,17 @@ class SampledPsf(Psf):
         steps = self._steps
         at_px = np.arange(side_px * steps) / steps - side_px / 2
         shares = np.maximum(self._before_cut(at_px, at_px), 0.0)
-        shares[0], shares[:, 0] = 0.0, 0.0
+        shares[0] = 0.0
+        shares[:, 0] = 0.0
         of_phases = shares.reshape(side_px, steps, side_px, steps)
         of_phases /= of_phases.sum(axis=(0, 2), keepdims=True)
         return np.pad(shares, (0, 1)).astype(np.float32)
+
+    @property
+    def _offsets_px(self) -> FloatArray:
+        """The offsets (n,) of the table's rows, and of its columns, px."""
+        count = len(self._table)
+        return np.asarray((np.arange(count) - count // 2) / self._steps)
 
     @cached_property
     def peak_share(self) -> float:
@@ -556,16 +570,17 @@ class SampledPsf(Psf):
         """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth
         of the largest.
         """
-        at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
-        squares = at_px**2
+        squares = self._offsets_px**2
         logs = np.log(np.maximum(self._table, 1e-30))
         smallest_share_log = math.log(1e-4 * self.peak_share)
         variance_x, variance_y = self.variance_px2
         smallest_px2 = math.inf
         for scale in 2 * np.geomspace(1.0, 300.0, 20):
-            x, y = float(scale) * variance_x, float(scale) * variance_y
+            x = float(scale) * variance_x
+            y = float(scale) * variance_y
+            log_factors = logs + squares / x + squares[:, None] / y
             # the table is interpolated
-            log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01
+            log_factor = float(log_factors.max()) + 0.01
             reach_px2 = scale * (log_factor - smallest_share_log)
             if reach_px2 < smallest_px2:
                 smallest_px2 = reach_px2
@@ -596,7 +611,8 @@ class SampledPsf(Psf):
         fraction_x, fraction_y = fraction_px
         x = pixel[:, None] - fraction_x
         y = pixel[:, None] - fraction_y
-        return np.asarray(self.shares(x[None], y[:, None]) * electrons_per_s, dtype=np.float32)
+        shares = self.shares(x[None], y[:, None])
+        return np.asarray(shares * electrons_per_s, dtype=np.float32)
 
     def spread(
         self,
@@ -619,7 +635,9 @@ class SampledPsf(Psf):
         return image.astype(np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """The largest of the four corners' of a pixel, by the shares at half pixels."""
+        """See `Psf.cut_share`: the largest for stars on the four corners of a pixel, by the shares
+        at half pixels.
+        """
         first = len(self._halves) // 2 - size_px
         if first < 0:
             return 0.0
@@ -632,22 +650,24 @@ class SampledPsf(Psf):
         return 1 - least
 
     def outside_share(self, size_px: int) -> float:
-        """The largest of the table beyond half of that side."""
-        from_middle = np.abs(np.arange(len(self._table)) - len(self._table) // 2)
-        far = from_middle >= size_px * self._steps / 2
-        largest = max(self._table[far].max(initial=1e-30), self._table[:, far].max(initial=1e-30))
-        return float(largest)
+        """See `Psf.outside_share`: the largest share of the table beyond half of that side."""
+        far = np.abs(self._offsets_px) >= size_px / 2
+        in_rows = self._table[far].max(initial=1e-30)
+        in_columns = self._table[:, far].max(initial=1e-30)
+        return float(max(in_rows, in_columns))
 
     def shader(self, side_px: int) -> ShareShader:
-        """The same table: in each cell between four places what its bilinear interpolation is
-        made of.
+        """See `Psf.shader`: the table by cells of its grid, each with its four coefficients of
+        bilinear interpolation.
         """
         near = self._table[:-1, :-1]
         right = self._table[:-1, 1:]
         down = self._table[1:, :-1]
         both = self._table[1:, 1:]
-        cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
-        return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
+        twist = both - right - down + near
+        cells = np.stack([near, right - near, down - near, twist], axis=2)
+        defines = (f"SHARE_STEPS {self._steps}.0",)
+        return ShareShader(defines, {}, np.ascontiguousarray(cells))
 
     def blurred(self, sigma_px: float) -> "SampledPsf":
         """The samples convolved, with room for what spreads beyond them."""
@@ -655,7 +675,8 @@ class SampledPsf(Psf):
 
         sigma = sigma_px * self.per_px
         wide = np.pad(self.samples, math.ceil(6 * sigma))
-        spread = np.fft.ifft2(fourier_gaussian(np.fft.fft2(wide), sigma)).real
+        transformed = fourier_gaussian(np.fft.fft2(wide), sigma)
+        spread = np.fft.ifft2(transformed).real
         return SampledPsf(spread, self.per_px, self.pixel_integrated)
 
 
@@ -699,19 +720,22 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
 
 
 def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
-    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and
-    the PSF of each.
+    """Gaussians that together stand for the light of an evenly lit square: their places along its
+    side, in sides from its middle, and the PSF of each.
 
-    The PSF is `psf` with what the points lack of the square's variance; `side_px` is in its pixels.
+    The PSF is `psf`, widened by the variance of the square that the places lack; `side_px` is in
+    its pixels.
     """
     narrow_px = min(psf.width_px)
     if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:
         points = TWO
     else:
-        wanted = math.ceil(side_px / (FINE_SIGMAS * max(narrow_px, SHARPEST_PX)))
+        apart_px = FINE_SIGMAS * max(narrow_px, SHARPEST_PX)
+        wanted = math.ceil(side_px / apart_px)
         parts = min(max(wanted, MIN_PARTS), MAX_PARTS)
         points = (np.arange(parts) + 0.5) / parts - 0.5
-    spread_px = side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2)))
+    variance = float(np.mean(points**2))
+    spread_px = side_px * math.sqrt(PIXEL_VARIANCE - variance)
     return points, psf.blurred(spread_px)
 
 
@@ -724,7 +748,8 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
     """
     near = abs(offset_px) - 0.5
     far = abs(offset_px) + 0.5
-    return 0.5 * (math.erfc(near / (sigma_px * SQRT2)) - math.erfc(far / (sigma_px * SQRT2)))
+    unit_px = sigma_px * SQRT2
+    return 0.5 * (math.erfc(near / unit_px) - math.erfc(far / unit_px))
 
 
 def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
@@ -736,7 +761,8 @@ def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
 
     near = np.abs(offset_px) - 0.5
     far = np.abs(offset_px) + 0.5
-    return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
+    unit_px = sigma_px * SQRT2
+    return np.asarray(0.5 * (erfc(near / unit_px) - erfc(far / unit_px)))
 
 
 def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -> Float32Array:
@@ -745,7 +771,8 @@ def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -
     """
     powers = share_polynomial(sigma_px, footprint_px / 2 + 0.5)
     if powers is None:
-        edges = np.concatenate([offset_px - np.float32(0.5), offset_px[-1:] + np.float32(0.5)])
+        half = np.float32(0.5)
+        edges = np.concatenate([offset_px - half, offset_px[-1:] + half])
         edges *= np.float32(1 / (sigma_px * SQRT2))
         share: Float32Array = np.diff(_shader_erf(edges), axis=0)
         return np.maximum(share, 0) * np.float32(0.5)
@@ -780,7 +807,8 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
     enough: under a sigma of 0.5 px.
     """
     # close together at the edge, as Chebyshev's
-    distance_px = reach_px * np.sin(np.linspace(0.0, np.pi / 2, FIT_PLACES))
+    angle = np.linspace(0.0, np.pi / 2, FIT_PLACES)
+    distance_px = reach_px * np.sin(angle)
     shares = np.array([pixel_share(float(place), sigma_px) for place in distance_px])
     wanted = np.log2(np.maximum(shares, shares[0] * 1e-12))
     scaled = (distance_px / reach_px) ** 2
@@ -788,8 +816,10 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
         terms = np.polynomial.chebyshev.chebvander(2 * scaled - 1, degree)
         weight = np.maximum(shares / shares[0], 1e-7)
         for _ in range(FIT_ROUNDS):
-            coefficients, *_ = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)
-            error = np.abs(np.exp2(np.minimum(terms @ coefficients, 0.0)) - shares)
+            weighted_terms = terms * weight[:, None]
+            coefficients, *_ = np.linalg.lstsq(weighted_terms, wanted * weight, rcond=None)
+            fitted = np.exp2(np.minimum(terms @ coefficients, 0.0))
+            error = np.abs(fitted - shares)
             if error.max() <= MAX_SHARE_ERROR:
                 chebyshev = np.polynomial.Chebyshev(coefficients, domain=[0.0, reach_px**2])
                 power = chebyshev.convert(kind=np.polynomial.Polynomial)

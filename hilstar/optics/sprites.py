@@ -76,24 +76,21 @@ class Candidates:
         keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
-            same = (
+            same_stars = (
                 stars.vectors is last.vectors
                 and stars.electrons_per_s is last.electrons_per_s
                 and stars.grid is last.grid
             )
+            same_image = camera is last_camera and margin_px == last_margin_px
             difference = (icrs_to_image - last_icrs_to_image).ravel()
             # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from
             # R to S: roll counts as well.
             chord = math.sqrt(float(difference @ difference) / 8)
             turned_rad = 2 * math.asin(min(1.0, chord))
-            if (
-                same
-                and camera is last_camera
-                and margin_px == last_margin_px
-                and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD
-            ):
+            if same_stars and same_image and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
                 return near
-        star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
+        reach_rad = KEPT_TURN_RAD if keeps else 0.0
+        star = stars_about(stars, icrs_to_image, camera, margin_px, reach_rad)
         near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
         if keeps:
             self._kept = stars, camera, margin_px, icrs_to_image.copy(), near
@@ -131,15 +128,14 @@ class FrameLight:
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1)
     // 2`. A star's light is divided among up to `per_star` sprites. `capped` stars are drawn
-    coarser than they should be, or not at all, because
-    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as
-    paths, None for points. `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that
-    changes over the field; None draws all by its mean. `extended` is the frame's light other than
-    stars, in the order in which it is drawn; `discs` names the bodies among it, and `over_white`
-    those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for
-    `star`.
-    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each,
-    and `lights` the extended light of each, moved to where that primary has to be drawn.
+    coarser than they should be, or not at all, because the work of a frame is bounded.
+    `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
+    `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field;
+    None draws all by its mean. `extended` is the frame's light other than stars, in the order in
+    which it is drawn; `discs` names the bodies among it, and `over_white` those of them that are
+    brighter than white. Sprites of `added` light have -1, -2 and on for `star`. Where the monitor's
+    primaries are driven apart, `primaries` float32 (n, 3) is the light of each, and `lights` the
+    extended light of each, moved to where that primary has to be drawn.
     """
 
     data: npt.NDArray[np.void]
@@ -304,7 +300,8 @@ def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
     columns).
     """
     rates = stars.rates_e_per_s
-    return np.asarray(rates @ shares[: len(rates)] / (rates.sum() or 1.0))
+    total = rates.sum() or 1.0
+    return np.asarray(rates @ shares[: len(rates)] / total)
 
 
 def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
@@ -321,7 +318,8 @@ def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
 
 def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
     """Shares (n, columns) of light of colours (n,), by those of BV_MAG."""
-    return np.stack([np.interp(bv_mag, BV_MAG, column) for column in by_bv.T], axis=-1)
+    shares = [np.interp(bv_mag, BV_MAG, column) for column in by_bv.T]
+    return np.stack(shares, axis=-1)
 
 
 def shares_of_sprites(
@@ -435,7 +433,9 @@ def clipped_sprites(
     x = np.rint(sprites.x_px[bright]).astype(int)
     y = np.rint(sprites.y_px[bright]).astype(int)
     width, height = resolution_px
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    across = (x >= 0) & (x < width)
+    down = (y >= 0) & (y < height)
+    inside = across & down
     bright = bright[inside]
     x = x[inside]
     y = y[inside]
@@ -450,7 +450,8 @@ def clipped_sprites(
         brightest_first = np.argpartition(-own_light[doubtful], MAX_DOUBTFUL)
         doubtful = doubtful[brightest_first[:MAX_DOUBTFUL]]
     if len(doubtful):
-        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], psf) > limit[doubtful]
+        light = _light_at(sprites, x[doubtful], y[doubtful], psf)
+        over[doubtful] = light > limit[doubtful]
     return np.asarray(bright[over], dtype=np.intp)
 
 
@@ -466,7 +467,8 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
         offset_x = x[:, None] - sprites.x_px[close]
         offset_y = y[:, None] - sprites.y_px[close]
         share = psf.shares(offset_x, offset_y)
-        share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
+        farther = np.maximum(np.abs(offset_x), np.abs(offset_y))
+        share[farther > reach] = 0.0
         rates = sprites.data["electrons_per_s"][close].astype(np.float64)
         return np.asarray(share @ rates)
     order = close[np.argsort(sprites.x_px[close])]
@@ -476,7 +478,8 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
     pixel = np.repeat(np.arange(len(x)), count)
     # the pairs of a pixel are `count` sprites of `order` from its first on
     first_pair = np.cumsum(count) - count
-    other = order[np.arange(len(pixel)) + np.repeat(first - first_pair, count)]
+    to_sprite = np.repeat(first - first_pair, count)
+    other = order[np.arange(len(pixel)) + to_sprite]
     offset_y = y[pixel] - sprites.y_px[other]
     near = np.abs(offset_y) <= reach
     pixel = pixel[near]
@@ -489,7 +492,8 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
 
 def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:
     """Which pixels (n,) of an axis are within a footprint of one of the `wanted` (k,)."""
-    near = np.zeros(int(wanted.max(initial=0)) + 2 * size_px + 2, dtype=np.bool_)
+    last = int(wanted.max(initial=0)) + 2 * size_px + 1
+    near = np.zeros(last + 1, dtype=np.bool_)
     for place in set(wanted.tolist()):
         near[place : place + 2 * size_px + 1] = True
     return near.take(pixel + size_px, mode="clip")

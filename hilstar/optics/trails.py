@@ -134,8 +134,10 @@ def trails(
     path = np.repeat(np.arange(len(seen)), counts)
     first_of_path = np.cumsum(counts) - counts
     order = np.arange(len(path)) - np.repeat(first_of_path, counts)
-    part = ((end - begin) / np.maximum(counts, 1))[path]
-    first_s = lit.begin_s[path] + (begin[path] + order * part) * lit.length_s
+    part_of_path = (end - begin) / np.maximum(counts, 1)
+    part = part_of_path[path]
+    first_part = begin[path] + order * part
+    first_s = lit.begin_s[path] + first_part * lit.length_s
     last_s = first_s + part * lit.length_s
     x_px, y_px = view.places_px(seen, path, (first_s + last_s) / 2)
     light = seen.rates_e_per_s(path, first_s, last_s) * part
@@ -144,8 +146,9 @@ def trails(
     is_lit = shown[path] & (light > 0)
     star = seen.index[path[is_lit]]
     size_px = view.camera.resolution_px
-    x_px, y_px, light = x_px[is_lit], y_px[is_lit], light[is_lit]
-    sprites = pack_sprites(x_px, y_px, light, star, size_px, brush.psf.footprint_px)
+    sprites = pack_sprites(
+        x_px[is_lit], y_px[is_lit], light[is_lit], star, size_px, brush.psf.footprint_px
+    )
     trailed = np.flatnonzero(np.isin(seen.index, sprites.star))
     most = int(np.bincount(path[is_lit], minlength=1).max(initial=1))
     coarser = (counts < wanted)[trailed]
@@ -162,19 +165,22 @@ def sprite_counts(
     """
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)
-    x_px, y_px = view.places_px(seen, which, (lit.begin_s + at * lit.length_s).ravel())
+    seconds = lit.begin_s + at * lit.length_s
+    x_px, y_px = view.places_px(seen, which, seconds.ravel())
     x_px = x_px.reshape(SAMPLES, -1)
     y_px = y_px.reshape(SAMPLES, -1)
     ends = Chords(x_px[[0, -1]], y_px[[0, -1]])
     off_x = (1 - at) * x_px[0] + at * x_px[-1] - x_px
     off_y = (1 - at) * y_px[0] + at * y_px[-1] - y_px
-    bulge_px = BULGE * np.sqrt((off_x * off_x + off_y * off_y).max(axis=0))
+    largest_px2 = (off_x * off_x + off_y * off_y).max(axis=0)
+    bulge_px = BULGE * np.sqrt(largest_px2)
     margin_px = brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px)
     begin, end = ends.on_image(view.camera.resolution_px, margin_px)
     sigma_x, sigma_y = brush.psf.width_px
     step_x = np.diff(x_px, axis=0) / sigma_x
     step_y = np.diff(y_px, axis=0) / sigma_y
-    length = np.sqrt(step_x * step_x + step_y * step_y).sum(axis=0) * (end - begin)
+    steps = np.sqrt(step_x * step_x + step_y * step_y)
+    length = steps.sum(axis=0) * (end - begin)
     length = np.nan_to_num(length, nan=brush.most * SPACING_SIGMA)
     spaces = np.floor(np.minimum(length / SPACING_SIGMA, brush.most))
     at_least = np.ceil((end - begin) * lit.length_s / LIGHT_S)
@@ -188,7 +194,8 @@ def with_trails(sprites: FrameLight, found: Trails, first: int) -> FrameLight:
     `first`.
     """
     trail_sprites = found.sprites
-    whole = with_sprites(sprites, [replace(trail_sprites, star=trail_sprites.star + first)])
+    numbered = replace(trail_sprites, star=trail_sprites.star + first)
+    whole = with_sprites(sprites, [numbered])
     return replace(
         whole,
         per_star=max(sprites.per_star, trail_sprites.per_star),
@@ -245,27 +252,35 @@ def disc_trail(
     light.
     """
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
-    radius_px = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px
+    disc_now = disc_of(seen, name, 0.0, None)
+    radius_px = disc_now.radius_rad * view.camera.focal_length_px
     radius_sigma = radius_px / min(brush.psf.width_px)
     coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
     count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
     if not count:
         return None
-    edges_s = lit.begin_s[0] + np.linspace(begin[0], end[0], count + 1) * lit.length_s
-    middles_s = (edges_s[1:] + edges_s[:-1]) / 2
+    parts = np.linspace(begin[0], end[0], count + 1)
+    edges_s = lit.begin_s[0] + parts * lit.length_s
+    begins_s = edges_s[:-1]
+    ends_s = edges_s[1:]
+    middles_s = ((ends_s + begins_s) / 2).tolist()
     share = float(end[0] - begin[0]) / count
-    rates = seen.rates_e_per_s(np.zeros(count, dtype=np.intp), edges_s[:-1], edges_s[1:])
+    itself = np.zeros(count, dtype=np.intp)
+    rates = seen.rates_e_per_s(itself, begins_s, ends_s)
     if not rates.any():
         return None
-    bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s.tolist()]
+    bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s]
     lights: list[ExtendedLight] = []
     if count > 1:
         # Together they hide what the one in the middle hides: each after the other would hide the
         # light of those before.
-        lights += _lights(bare[count // 2], view, middles_s[count // 2], brush, 0.0, covers=True)
-    along = tuple(disc.of_rate(float(rate)) for disc, rate in zip(bare, rates, strict=True))
-    for disc, second in zip(along, middles_s.tolist(), strict=True):
-        lights += _lights(disc, view, second, brush, share, covers=count == 1)
+        k = count // 2
+        lights += _lights(bare[k], view, middles_s[k], brush, 0.0, covers=True)
+    along: list[Disc] = []
+    for disc, rate, second in zip(bare, rates.tolist(), middles_s, strict=True):
+        lit_disc = disc.of_rate(rate)
+        along.append(lit_disc)
+        lights += _lights(lit_disc, view, second, brush, share, covers=count == 1)
     if not lights:
         return None
     middle = seen.directions(slice(None), lit.middle_s)[0]
@@ -281,7 +296,7 @@ def disc_trail(
         index=int(seen.index[0]),
         electrons_per_s=float(rates.sum()) * share,
         middle=middle,
-        along=along,
+        along=tuple(along),
         shares=np.full(count, share),
         lights=tuple(lights),
         brightest_e_per_s=image_max + radiance / smallest_px_rad**2,
@@ -303,7 +318,8 @@ def hidden(sprites: FrameLight, directions: FloatArray, found: DiscTrail) -> Fra
     """
     share_left = np.ones(len(sprites))
     for disc, share in zip(found.along, found.shares, strict=True):
-        share_left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))
+        is_behind = directions @ disc.direction > np.cos(disc.radius_rad)
+        share_left -= share * is_behind
     is_visible = share_left > 0
     data = sprites.data[is_visible]
     data["electrons_per_s"] *= share_left[is_visible].astype(np.float32)

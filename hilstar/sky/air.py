@@ -1,10 +1,10 @@
 """The air over a place on the Earth: it bends light, dims it, glows, and makes stars twinkle.
 
-Refraction is that of `stars.AirAbove`. The air mass
-is Kasten and Young's (1989, Appl. Opt. 28, 4735). Extinction is that of each star's own spectrum,
-tabulated at AIR_MASSES and straight between them. The glow of the sky goes with the zenith distance
-by van Rhijn's layer and with extinction (Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and
-3). Stars twinkle by Young's law (1967, AJ 72, 747).
+Refraction is that of `stars.AirAbove`. The air mass is Kasten and Young's (1989, Appl. Opt. 28,
+4735). Extinction is that of each star's own spectrum, tabulated at AIR_MASSES and straight between
+them. The glow of the sky goes with the zenith distance by van Rhijn's layer and with extinction
+(Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and 3). Stars twinkle by Young's law (1967, AJ
+72, 747).
 """
 
 from collections.abc import Callable
@@ -19,10 +19,12 @@ from hilstar.sky.electrons import Optics, Photometry, electron_response, referen
 from hilstar.sky.spectrum import DATA_DIR, Curve, integration_nodes, load_curve
 from hilstar.sky.stars import AirAbove, Stars, tell
 
+# at which rates are tabulated; magnitudes are linear between them
 AIR_MASSES = np.array([0.0, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0])
 EXTINCTION, NIGHT_SKY = DATA_DIR / "extinction.csv", DATA_DIR / "night_sky.csv"
 VAN_RHIJN = 0.96  # an emitting layer at 130 km
 STEP_NS = NS_PER_S  # the zenith of a second: 15 arcsec, 0.4 mmag at an air mass of 5
+# of the Sun's altitude: above it the sky is brighter than a night's table says
 TWILIGHT_DEG = -12.0
 MAX_TWINKLE = 1.0  # beyond it, near the horizon, the law of weak scintillation ends
 
@@ -76,8 +78,8 @@ def extinction_names() -> tuple[str, ...]:
 
 
 def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
-    """A tracker's optics behind so many air masses; the ends of a table of extinction hold
-    beyond it.
+    """A tracker's optics behind so many air masses. Beyond a table of extinction its end values
+    hold.
     """
     low, high = optics.range_nm
     knots = [c.wavelength_nm for c in (optics.transmission, extinction) if len(c.wavelength_nm)]
@@ -94,8 +96,8 @@ def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
 def dimmed_mag(
     rates: Callable[[Optics], FloatArray], optics: Optics, extinction: Curve
 ) -> FloatArray:
-    """How much fainter (masses, n) spectra are behind AIR_MASSES; `rates` gives their electrons
-    through optics.
+    """How much fainter spectra are behind AIR_MASSES, mag (masses, n); `rates` gives their
+    electrons (n,) through optics.
     """
     by_masses = []
     for masses in AIR_MASSES.tolist():
@@ -107,8 +109,8 @@ def dimmed_mag(
 def glow_e_per_s_arcsec2(
     spectrum: Curve, v_mag_arcsec2: float, optics: Optics, photometry: Photometry
 ) -> float:
-    """Electrons per second and square arcsecond of a sky of this V and a spectrum's shape: as
-    zodiacal light's.
+    """Electrons per second and square arcsecond of a night sky of this V surface brightness, with
+    the shape of a spectrum.
     """
     passband = load_curve("johnson-v", "johnson-v")
     nm, weight_m = integration_nodes(passband, spectrum)
@@ -123,8 +125,8 @@ def glow_e_per_s_arcsec2(
 
 
 def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Curve:
-    """A curve with the knots of another within a range, so that a product of both is integrated
-    as it is.
+    """A curve with the knots of another within a range added, so that the product of both is
+    integrated exactly.
     """
     low, high = range_nm
     nm = np.unique(np.concatenate([curve.wavelength_nm, other.wavelength_nm, range_nm]))
@@ -134,12 +136,12 @@ def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Cur
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteAir:
-    """The air of a place: `up_at` a UTC, ns, the constants of refraction, rad, and how it dims,
-    glows and twinkles.
+    """The air over a place: the zenith (`up_at` a UTC, ns), the constants of refraction, rad, and
+    how it dims stars, glows and makes them twinkle.
 
-    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last
-    sunlight. `glow_e_per_s_sr` (channels,) is that at the zenith, and `v_extinction_mag` that of V
-    by air mass.
+    `dimming_mag` (channels, masses, n + 1) is that of each star of the catalogue by row, and last
+    of sunlight. `glow_e_per_s_sr` (channels,) is the glow at the zenith, `v_extinction_mag` the
+    extinction of V for an air mass.
     """
 
     up_at: Callable[[int], FloatArray]

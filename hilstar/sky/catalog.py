@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError, cannot_read, shortened
 from hilstar.basics.reading import open_lines
 
@@ -83,9 +83,8 @@ class Catalog:
     `range_mag` in Hp with `period_d`, NaN where none is given; `maximum_jd` is a time of its
     largest light, which a user's table may have. `multiple` is its flag H59 of doubles (C resolved,
     G accelerated, O orbit, V variability-induced, X unexplained scatter), with `separation_arcsec`
-    where it resolved the pair:
-    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts
-    all rows of the source, and `notes` say what became of them.
+    where it resolved the pair: V and the colours are then those of both, except for 472 of 11 101
+    entries. `rows_read` counts all rows of the source, and `notes` say what became of them.
     """
 
     hip: npt.NDArray[np.int32]
@@ -124,8 +123,9 @@ class Catalog:
         known = np.flatnonzero(np.isfinite(self.maximum_jd))
         turns = (jd - self.maximum_jd[known]) / self.period_d[known]
         v_mag = self.v_mag.copy()
-        v_mag[known] -= self.range_mag[known] / 2 * np.cos(2 * np.pi * turns)
-        is_variable = np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES])
+        half_mag = self.range_mag[known] / 2
+        v_mag[known] -= half_mag * np.cos(2 * np.pi * turns)
+        is_variable = _vary(self.variable)
         count = int(is_variable.sum()) - len(known)
         note = (
             f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch"
@@ -147,27 +147,31 @@ class Catalog:
             return f"HIP {self.hip[row]}"
         identifier = int(self.identifier[row])
         if self.designation == TYCHO:
-            region, number = divmod(identifier, TYC_REGION)
-            return f"{TYCHO} {region}-{number // 10}-{number % 10}"
+            region, rest = divmod(identifier, TYC_REGION)
+            number, component = divmod(rest, 10)
+            return f"{TYCHO} {region}-{number}-{component}"
         return f"{self.designation} {identifier}"
 
     def identifier_of(self, name: str) -> int | None:
         """The identifier in a name that `name` gives to a star without a HIP number; None for
         any other text.
         """
-        if not self.designation or not name.startswith(f"{self.designation} "):
+        prefix = f"{self.designation} "
+        if not self.designation or not name.startswith(prefix):
             return None
-        numbers = name.removeprefix(f"{self.designation} ").split("-")
-        if not all(n.isascii() and n.isdigit() and len(n) <= MAX_DIGITS for n in numbers):
-            return None
+        numbers: list[int] = []
+        for digits in name.removeprefix(prefix).split("-"):
+            if not (digits.isascii() and digits.isdigit()) or len(digits) > MAX_DIGITS:
+                return None
+            numbers.append(int(digits))
         if self.designation == TYCHO:
             if len(numbers) != 3:
                 return None
-            region, number, component = map(int, numbers)
+            region, number, component = numbers
             return region * TYC_REGION + number * 10 + component
         if len(numbers) != 1:
             return None
-        return int(numbers[0])
+        return numbers[0]
 
 
 def column_names() -> list[str]:
@@ -303,11 +307,11 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
     values: dict[str, FloatArray] = {}
     for name, (_, per_unit) in FIELDS.items():
         steps = columns[name]
-        values[name] = steps / per_unit
-        values[name][steps == np.iinfo(steps.dtype).min] = np.nan
+        blank = np.iinfo(steps.dtype).min
+        values[name] = np.where(steps == blank, np.nan, steps / per_unit)
     letters = {name: columns[name].astype(np.uint8).view("S1") for name in LETTERS}
     variable = letters["variable"]
-    varies = np.isin(variable, [bytes([letter]) for letter in VARIABLE_TYPES])
+    varies = _vary(variable)
     hip = columns["hip"].astype(np.int32)
     range_mag = values.pop("hp_faintest_mag") - values.pop("hp_brightest_mag")
     range_mag = np.where(varies, range_mag, np.nan)
@@ -324,6 +328,12 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
     return plain_catalog("HIP", rows_read, values | plain)
 
 
+def _vary(variable: Letters) -> BoolArray:
+    """Which stars (n,) vary by themselves, by their types."""
+    types = [bytes([letter]) for letter in VARIABLE_TYPES]
+    return np.isin(variable, types)
+
+
 class StarName(NamedTuple):
     """A star's designation ("α Ori", "51 Peg") and its proper name ("Betelgeuse"), each "" where
     it has none.
@@ -336,9 +346,12 @@ class StarName(NamedTuple):
 @cache
 def star_names() -> dict[int, StarName]:
     """The designations and names of 3300 stars by HIP number (see `tools/make_star_names.py`)."""
+    star_of_hip: dict[int, StarName] = {}
     with STAR_NAMES.open(encoding="utf-8", newline="") as file:
-        rows = csv.DictReader(line for line in file if not line.startswith("#"))
-        return {int(row["hip"]): StarName(row["designation"], row["name"]) for row in rows}
+        for row in csv.DictReader(line for line in file if not line.startswith("#")):
+            hip = int(row["hip"])
+            star_of_hip[hip] = StarName(row["designation"], row["name"])
+    return star_of_hip
 
 
 def label_of(hip: int) -> str:
@@ -346,5 +359,6 @@ def label_of(hip: int) -> str:
     any.
     """
     designation, name = star_names().get(hip, ("", ""))
-    number = f"HIP {hip}" if hip else ""
-    return designation or name or number
+    if designation or name or not hip:
+        return designation or name
+    return f"HIP {hip}"

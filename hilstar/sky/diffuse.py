@@ -60,8 +60,8 @@ class TangentImage:
         return x * scale + middle, y * scale + middle
 
     def seen_by(self, px_rad: float, sigma_px: float) -> "TangentImage":
-        """The same for a camera whose finest pixels have `px_rad`: with pixels nearly as large,
-        and spread by a Gaussian.
+        """The image for a camera whose finest pixels have `px_rad`: with pixels nearly as large,
+        and spread by a Gaussian of `sigma_px` of these.
         """
         from scipy.ndimage import gaussian_filter
 

@@ -7,11 +7,9 @@ alone, so it is tabulated once per bench; for AGS it is one number.
 Electron rates from real spectra by colour: the Pickles library (Pickles 1998, PASP 110, 863).
 
 Black bodies fail where molecules take over: B-V saturates near 1.5 and turns back, V-I does not. So
-the
-logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the
-hottest:
-fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of held-out
-stars.
+the logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the
+hottest: fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of
+held-out stars.
 """
 
 from collections.abc import Sequence
@@ -56,14 +54,12 @@ Weighting = Literal["energy", "photon"]
 PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 
 # Natural cubic splines with knots at equal shares of the library. 7 to 14 knots were tried, without
-# B-V and with
-# it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within 1 % (median)
-# and 3 % (95 %)
-# for V-I < 2.5 on the built-in sensors and a flat one; beyond 12 knots nothing improves.
+# B-V and with it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within
+# 1 % (median) and 3 % (95 %) for V-I < 2.5 on the built-in sensors and a flat one; beyond 12 knots
+# nothing improves.
 VI_KNOT_COUNT = 12
 # Up to here (about F0) B-V tells supergiants and reddened stars from dwarfs of the same V-I; past
-# it, B-V
-# follows the metal lines in the blue and makes the rates of cool supergiants worse.
+# it, B-V follows the metal lines in the blue and makes the rates of cool supergiants worse.
 MAX_BV_TERM_MAG = 0.3
 # For stars without V-I. Late M giants have the B-V of K giants and ten times their electrons. The
 # fit excludes them: their rates are wrong, and those of the K giants, fifty times as many to V =
@@ -159,8 +155,7 @@ def reference_mean_w_m2_m(photometry: Photometry) -> float:
     """<F_ref> of a V = 0 star through Johnson V, W/m2/m.
 
     "vega" is the published band average itself, whatever the weighting. "iau-bolometric" is the
-    thesis's:
-    a 9602 K black body with the IAU's bolometric zero point (eq. 3.14, 3.15).
+    thesis's: a 9602 K black body with the IAU's bolometric zero point (eq. 3.14, 3.15).
     """
     if photometry.zero_point == "vega":
         return VEGA_V0_W_M2_M

@@ -52,7 +52,7 @@ NOISE = 0.13
 LATE_SUBCLASS = (55.0, 65.0)
 LATE_EXTRA = 1.5
 TREND_DEGREE = 3  # of the polynomial in V-I that the rates' logarithms depart from
-BLOCK_STARS = 4000
+BLOCK_STARS = 4000  # evaluated at once, which bounds the memory
 
 
 def luminosity_class(spectral_type: npt.NDArray[np.bytes_]) -> npt.NDArray[np.str_]:
@@ -84,13 +84,20 @@ def _read(text: str) -> tuple[float, float]:
     if type_match is None:
         return np.nan, np.nan
     letter, first, other, second = type_match.groups()
-    subclass = [10.0 * LETTERS.index(letter) + float(first or 5)]
+    subclasses = [_subclass(letter, first or "5")]
     if first and second:
-        subclass.append(10.0 * LETTERS.index(other or letter) + float(second))
+        subclasses.append(_subclass(other or letter, second))
+    subclass = float(np.mean(subclasses))
     without_companion = text.partition("+")[0]
     classes = [CLASSES.get(name, 1.0) for name in CLASS.findall(without_companion)]
-    mean_class = float(np.mean(classes)) if classes else np.nan
-    return float(np.mean(subclass)), mean_class
+    if not classes:
+        return subclass, np.nan
+    return subclass, float(np.mean(classes))
+
+
+def _subclass(letter: str, digits: str) -> float:
+    """A type's place in the row of all, ten to a letter: A0 is 20."""
+    return 10.0 * LETTERS.index(letter) + float(digits)
 
 
 def star_types(catalog: Catalog) -> FloatArray:
@@ -124,7 +131,8 @@ def bare_and_dusty() -> electrons.Library:
     bare = electrons.load_library()
     wavelength_nm = bare.wavelength_nm
     curve = CubicSpline(DUST_PER_UM, DUST_MAG, bc_type="natural")
-    flux = bare.flux * flux_ratio(DUST_EBV_MAG * curve(1000.0 / wavelength_nm))
+    extinction_mag = DUST_EBV_MAG * curve(1000.0 / wavelength_nm)
+    flux = bare.flux * flux_ratio(extinction_mag)
     behind = replace(bare, flux=flux)
     v = read_curve_csv(DATA_DIR / "johnson-v.csv")
     i = read_curve_csv(DATA_DIR / "bessell-i.csv")
@@ -169,7 +177,8 @@ class TypeTable:
         rate = self.by_colour.electrons_per_s(v_mag, bv_mag, vi_mag)
         if kind is None:
             return rate
-        known = np.flatnonzero(np.isfinite(kind).all(axis=1) & np.isfinite(vi_mag))
+        has_type = np.isfinite(kind).all(axis=1)
+        known = np.flatnonzero(has_type & np.isfinite(vi_mag))
         kinds, which = np.unique(kind[known], axis=0, return_inverse=True)
         weight = self.weight * _alike_types(kinds, self.spectra)
         library_vi_mag = self.spectra[:, 2]
@@ -189,12 +198,14 @@ def _alike_types(kind: FloatArray, other: FloatArray) -> FloatArray:
     or more), shape (n, k).
     """
     subclass_length, class_length = TYPE_LENGTHS
-    late = 1 + LATE_EXTRA * np.interp(kind[:, 0], LATE_SUBCLASS, (0.0, 1.0))
-    other_late = 1 + LATE_EXTRA * np.interp(other[:, 0], LATE_SUBCLASS, (0.0, 1.0))
-    subclass_apart = (kind[:, 0, None] - other[:, 0]) / subclass_length
+    subclass = kind[:, 0]
+    other_subclass = other[:, 0]
+    late = 1 + LATE_EXTRA * np.interp(subclass, LATE_SUBCLASS, (0.0, 1.0))
+    other_late = 1 + LATE_EXTRA * np.interp(other_subclass, LATE_SUBCLASS, (0.0, 1.0))
+    subclass_apart = (subclass[:, None] - other_subclass) / subclass_length
     class_apart = (kind[:, 1, None] - other[:, 1]) / class_length
-    alike = np.exp(-(subclass_apart**2 + class_apart**2) / 2)
-    return np.asarray(late[:, None] * other_late * alike)
+    apart = subclass_apart**2 + class_apart**2
+    return np.asarray(late[:, None] * other_late * np.exp(-apart / 2))
 
 
 def _alike_colours(vi_mag: FloatArray, other_mag: FloatArray) -> FloatArray:
@@ -227,13 +238,15 @@ def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) 
     trend = _trend(library.vi_mag)
     # The departures' weights are at right angles to the trend.
     terms = TREND_DEGREE + 1
-    system = np.block([[covariance, trend], [trend.T, np.zeros((terms, terms))]])
+    none = np.zeros((terms, terms))
+    system = np.block([[covariance, trend], [trend.T, none]])
     right_side = np.concatenate([np.log(rate), np.zeros(terms)])
     solution = np.linalg.solve(system, right_side)
     weight = solution[: len(rate)]
     coefficients = solution[len(rate) :]
     by_colour = electrons.fit_table(library.bv_mag[bare], library.vi_mag[bare], rate[bare])
-    return TypeTable(by_colour, coefficients, np.column_stack([kind, library.vi_mag]), weight)
+    spectra = np.column_stack([kind, library.vi_mag])
+    return TypeTable(by_colour, coefficients, spectra, weight)
 
 
 def tabulate_types(optics: electrons.Optics, photometry: electrons.Photometry) -> TypeTable:
@@ -250,9 +263,11 @@ def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
     """
     library = electrons.load_library()
     nm = library.wavelength_nm
-    detected = library.flux * nm * optics.quantum_efficiency(nm) * optics.transmission(nm)
+    photons = library.flux * nm
+    detected = photons * optics.quantum_efficiency(nm) * optics.transmission(nm)
     total = np.maximum(detected.sum(axis=1), np.finfo(np.float64).tiny)
-    shares = detected[:, nm >= from_nm].sum(axis=1) / total
+    beyond = detected[:, nm >= from_nm].sum(axis=1)
+    shares = beyond / total
     classes = np.array([kind[0] for kind in library.spectral_type])
     by_class = {}
     for letter in LETTERS:

@@ -23,13 +23,11 @@ MAX_SHIFT = 1.1  # largest aberration in units of v/c, for speeds up to 0.1 c
 
 BODY_CELL_RAD = 1e-6  # radius of a cell with one body: rounding
 # Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees take 23 to 11
-# us
-# and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
+# us and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
 # results/tradeoff.csv, culling: 1 to 6 degrees take the same time, a scan twenty times as long.
 CELL_DEG = 4.0
 # Within a cell stars are sorted by PARTS^2 parts of it: neighbours on the image follow each other,
-# which
-# saves a twelfth of drawing them.
+# which saves a twelfth of drawing them.
 PARTS = 4
 # arccos near 1 is accurate to 1e-8 rad only; a cell is enlarged by this.
 RADIUS_MARGIN_RAD = 1e-6
@@ -491,8 +489,7 @@ def aberrate(
     """Directions (n, 3) as a moving observer sees them; the velocity is ICRS, barycentric, in km/s.
 
     The exact special-relativistic formula (Klioner 2003, AJ 125, 1580, eq. 10). The caller keeps
-    the
-    speed under that of light.
+    the speed under that of light.
     """
     beta = np.asarray(observer_velocity_km_s, dtype=np.float64) / LIGHT_KM_S
     gamma_inverse = np.sqrt(1.0 - beta @ beta)

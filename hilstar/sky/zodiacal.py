@@ -27,7 +27,7 @@ W_M2_SR_M = 1e-8 * 1e6  # table 17's unit, 1e-8 W m-2 sr-1 um-1
 NEAR_DEG, FAR_DEG = 30.0, 90.0
 NEAR_SLOPES, FAR_SLOPES = (1.2, 0.8), (0.9, 0.6)
 J2000_JD = 2_451_545.0
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # of corners' shares: a blank corner with less has no part in a direction
 
 
 class Sunward(NamedTuple):
@@ -58,7 +58,9 @@ def sunward(vectors_icrs: FloatArray, tdb_jd: float) -> Sunward:
     earth = erfa.ufunc.epv00(tdb_jd, 0.0)[0]
     sun_x, sun_y, _ = -to_ecliptic @ earth["p"]
     x, y, z = to_ecliptic @ vectors_icrs.T
-    dlon = np.abs(np.arctan2(y * sun_x - x * sun_y, x * sun_x + y * sun_y))
+    beside_sun = y * sun_x - x * sun_y
+    towards_sun = x * sun_x + y * sun_y
+    dlon = np.abs(np.arctan2(beside_sun, towards_sun))
     lat = np.arcsin(np.clip(np.abs(z), 0.0, 1.0))
     return Sunward(np.degrees(dlon), np.degrees(lat))
 
@@ -77,8 +79,10 @@ def tabled_light(seen: Sunward) -> TabledLight:
     dlon_deg, lat_deg, log_radiance, blank = _table_17()
     i = _interval_of(dlon_deg, seen.dlon_deg)
     j = _interval_of(lat_deg, seen.lat_deg)
-    u = (seen.dlon_deg - dlon_deg[i]) / (dlon_deg[i + 1] - dlon_deg[i])
-    v = (seen.lat_deg - lat_deg[j]) / (lat_deg[j + 1] - lat_deg[j])
+    cell_deg = dlon_deg[i + 1] - dlon_deg[i]
+    cell_lat_deg = lat_deg[j + 1] - lat_deg[j]
+    u = (seen.dlon_deg - dlon_deg[i]) / cell_deg
+    v = (seen.lat_deg - lat_deg[j]) / cell_lat_deg
     corners = (
         (i, j, (1 - u) * (1 - v)),
         (i + 1, j, u * (1 - v)),
@@ -106,7 +110,11 @@ def _table_17() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """
     lines = BRIGHTNESS.read_text().splitlines()
     names = lines[1].split(",")[1:]  # such as lat_15_deg
-    lat_deg = np.array([float(name.split("_")[1]) for name in names])
+    latitudes = []
+    for name in names:
+        _, degrees, _ = name.split("_")
+        latitudes.append(float(degrees))
+    lat_deg = np.array(latitudes)
     rows = np.genfromtxt(lines[2:], delimiter=",")  # an empty cell is NaN
     dlon_deg = rows[:, 0]
     log_radiance = np.log(rows[:, 1:])

@@ -38,8 +38,7 @@ CLIPPED_SIGMA = 0.986578
 MIN_STEP_PX = 1e-7
 WITH_DIAGONALS = np.ones((3, 3), dtype=np.bool_)
 # Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10
-# times the
-# plain one, so that noise in the moment cannot throw the centre out of the window.
+# times the plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
 COUNTED_TYPES, COUNTED_AT_ONCE = (np.uint8, np.uint16), 1 << 16
 # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to
@@ -64,8 +63,7 @@ class CentroidSettings:
 
     `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2
     radius + 1 pixels wide. `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian
-    star from the places.
-    Raises InputError for a value out of range.
+    star from the places. Raises InputError for a value out of range.
     """
 
     threshold_sigma: float = 5.0
@@ -111,9 +109,8 @@ class Centroids:
     right, y down.
 
     `flux` is the sum in the window, `peak` the highest pixel of the blob, both above the background
-    and in the image's
-    unit; `pixels` counts the blob; `at_edge` says that the window leaves the image, which biases
-    the place inwards.
+    and in the image's unit; `pixels` counts the blob; `at_edge` says that the window leaves the
+    image, which biases the place inwards.
     """
 
     x_px: FloatArray
@@ -144,19 +141,19 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     sigma of the median.
 
     The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One
-    level for the image:
-    a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole
-    numbers, else 0), and the noise at least rounding's, step / sqrt 12. That of a noiseless float
-    image is 0, and then every pixel over the level belongs to a star: give a `LocalBackground` for
-    such an image.
+    level for the image: a gradient counts as noise. `step` is what the image was rounded to
+    (default: 1 for whole numbers, else 0), and the noise at least rounding's, step / sqrt 12. That
+    of a noiseless float image is 0, and then every pixel over the level belongs to a star: give a
+    `LocalBackground` for such an image.
     """
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
     _check(image)
+    counts: IntArray | None = None
     if image.dtype in COUNTED_TYPES:
         values, counts = _counted(image)
     else:
-        values, counts = image.astype(np.float64).ravel(), None
+        values = image.astype(np.float64).ravel()
     median = _median(values, counts)
     deviation = np.abs(values - median)
     sigma = MAD_TO_SIGMA * _median(deviation, counts)
@@ -164,9 +161,12 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     # counterpart on the other.
     is_background = deviation <= CLIP_SIGMAS * max(sigma, step)
     background = values[is_background]
-    weights = None if counts is None else counts[is_background]
+    weights = None
+    if counts is not None:
+        weights = counts[is_background]
     level = float(np.average(background, weights=weights))
-    variance = float(np.average((background - level) ** 2, weights=weights))
+    squared = (background - level) ** 2
+    variance = float(np.average(squared, weights=weights))
     noise = math.sqrt(variance) / CLIPPED_SIGMA
     return LocalBackground(level, max(noise, step / math.sqrt(12)))
 
@@ -179,7 +179,8 @@ def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
     counts = np.zeros(int(image.max()) + 1, dtype=np.intp)
     # whose whole numbers of 64 bits stay in a core's cache
     for begin in range(0, len(flat), COUNTED_AT_ONCE):
-        counts += np.bincount(flat[begin : begin + COUNTED_AT_ONCE], minlength=len(counts))
+        part = flat[begin : begin + COUNTED_AT_ONCE]
+        counts += np.bincount(part, minlength=len(counts))
     values = np.flatnonzero(counts)
     return values.astype(np.float64), counts[values]
 
@@ -190,7 +191,8 @@ def _median(values: FloatArray, counts: IntArray | None) -> float:
         return float(np.median(values))
     order = np.argsort(values, kind="stable")
     below = np.cumsum(counts[order])
-    middle_pixels = [(below[-1] - 1) // 2, below[-1] // 2]
+    pixels = below[-1]
+    middle_pixels = [(pixels - 1) // 2, pixels // 2]
     middle = np.searchsorted(below, middle_pixels, side="right")
     return float(values[order][middle].mean())
 
@@ -207,9 +209,11 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
         level = _median(*_counted(image))
     else:
         level = float(np.median(image))
-    rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
-    height = image.shape[0] // rows
-    width = image.shape[1] // columns
+    image_height, image_width = image.shape
+    rows = max(image_height // BLOCK_PX, 1)
+    columns = max(image_width // BLOCK_PX, 1)
+    height = image_height // rows
+    width = image_width // columns
     whole = image[: rows * height, : columns * width]
     blocks = whole.reshape(rows, height, columns, width).swapaxes(1, 2)
     # Sorted in two thirds of the time of float64, and exact for whole steps up to 2^24.
@@ -222,7 +226,8 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     is_background = deviation <= CLIP_SIGMAS * sigma
     values *= is_background
     squares = np.einsum("ij,ij->i", values, values, dtype=np.float64)
-    noise = np.sqrt(squares / is_background.sum(axis=1)) / CLIPPED_SIGMA
+    variance = squares / is_background.sum(axis=1)
+    noise = np.sqrt(variance) / CLIPPED_SIGMA
     noisier = float(np.percentile(noise, NOISIER_PERCENT))
     return LocalBackground(level, max(noisier, step / math.sqrt(12)))
 
@@ -232,7 +237,8 @@ def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     tenth of `np.median`'s time.
     """
     size = values.shape[1]
-    middle = np.sort(values, axis=1)[:, (size - 1) // 2 : size // 2 + 1]
+    in_order = np.sort(values, axis=1)
+    middle = in_order[:, (size - 1) // 2 : size // 2 + 1]
     return np.asarray(middle.mean(axis=1, keepdims=True))
 
 
@@ -245,8 +251,7 @@ def find_stars(
     or another shape.
 
     Without `background` it is estimated from the image. Stars whose blobs touch are one; a
-    neighbour inside the window
-    pulls the centre towards itself.
+    neighbour inside the window pulls the centre towards itself.
     """
     settings = settings or CentroidSettings()
     _check(image)
@@ -258,7 +263,8 @@ def find_stars(
     flux = stamps.sum(axis=(1, 2))
     height, width = image.shape
     reach = settings.radius_px
-    column, row = np.rint(x_px), np.rint(y_px)
+    column = np.rint(x_px)
+    row = np.rint(y_px)
     inside = (column >= reach) & (column < width - reach)
     inside &= (row >= reach) & (row < height - reach)
     if settings.psf_sigma_px is not None:
@@ -331,8 +337,10 @@ def squares(
     Beyond the image values are 0.
     """
     reach = np.arange(-radius_px, radius_px + 1)
-    column = np.rint(x_px).astype(np.intp)[:, None] + reach
-    row = np.rint(y_px).astype(np.intp)[:, None] + reach
+    middle_column = np.rint(x_px).astype(np.intp)
+    middle_row = np.rint(y_px).astype(np.intp)
+    column = middle_column[:, None] + reach
+    row = middle_row[:, None] + reach
     height, width = image.shape
     nearest_row = row.clip(0, height - 1)[:, :, None]
     nearest_column = column.clip(0, width - 1)[:, None, :]
@@ -370,8 +378,10 @@ def _gaussian_centres(
     sigma2 = settings.window_sigma_px**2
     lost = np.zeros(place.shape[1], dtype=np.bool_)
     for _ in range(settings.iterations):
-        values, dx, dy = squares(image, level, place[0], place[1], settings.radius_px)
-        weighted = values * np.exp(-0.5 * (dx**2 + dy**2) / sigma2)
+        x_px, y_px = place
+        values, dx, dy = squares(image, level, x_px, y_px, settings.radius_px)
+        distance2 = dx**2 + dy**2
+        weighted = values * np.exp(-0.5 * distance2 / sigma2)
         total = weighted.sum(axis=(1, 2))
         lost |= total <= 0
         total = np.where(lost, 1.0, total)
@@ -384,7 +394,8 @@ def _gaussian_centres(
         slope = 1 - second_px2 / total / sigma2
         step = first_px / total / np.maximum(slope, MIN_SLOPE)
         moved = np.where(lost, start, place + step)
-        lost |= (np.abs(moved - start) > settings.radius_px).any(axis=0)
+        from_start_px = np.abs(moved - start)
+        lost |= (from_start_px > settings.radius_px).any(axis=0)
         moved = np.where(lost, start, moved)
         arrived = np.abs(moved - place).max(initial=0.0) < MIN_STEP_PX
         place = moved
@@ -405,12 +416,16 @@ def _plain_centres(
     place = start
     middle = np.rint(start)
     for _ in range(settings.iterations):
-        values, dx, dy = squares(image, level, middle[0], middle[1], settings.radius_px)
+        x_px, y_px = middle
+        values, dx, dy = squares(image, level, x_px, y_px, settings.radius_px)
         total = values.sum(axis=(1, 2))
-        sums = np.stack([(values * dx).sum(axis=(1, 2)), (values * dy).sum(axis=(1, 2))])
+        sum_x = (values * dx).sum(axis=(1, 2))
+        sum_y = (values * dy).sum(axis=(1, 2))
+        sums = np.stack([sum_x, sum_y])
         step = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
         moved = middle + step
-        has_left = (np.abs(moved - start) > settings.radius_px).any(axis=0)
+        from_start_px = np.abs(moved - start)
+        has_left = (from_start_px > settings.radius_px).any(axis=0)
         lost = (total <= 0) | has_left
         place = np.where(lost, start, moved)
         still = np.array_equal(np.rint(place), middle)
@@ -436,9 +451,8 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     itself.
 
     Window and star are products of an x and a y part, so the curve of one axis does not depend on
-    the other's place.
-    Raises InputError where two places within a pixel are measured as one: the window is too narrow
-    for that star.
+    the other's place. Raises InputError where two places within a pixel are measured as one: the
+    window is too narrow for that star.
     """
     if settings.psf_sigma_px is None:
         raise InputError(

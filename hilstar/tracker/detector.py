@@ -36,13 +36,12 @@ DEFAULT_PITCH_UM = 13.0  # the CCD47-20's
 MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
 # A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a
-# pair. The mean
-# alone, without Landau's tail.
+# pair. The mean alone, without Landau's tail.
 RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
 RAY_STEP_PX = 0.25  # along a track, so that no pixel that it crosses is passed over
 
-FALSE_STAR_REACH_SIGMAS = 5.0
+FALSE_STAR_REACH_SIGMAS = 5.0  # beyond it lie 6e-7 of a Gaussian's light along an axis
 CodeArray = npt.NDArray[np.uint16]
 ChargeArray = npt.NDArray[Any]  # float64 in `noise_version = 1`, else float32
 
@@ -58,8 +57,8 @@ def cosmic_rays_e(
     silicon.
 
     The rate is that of hits on the sensor's face. Rays come isotropically, so a face sees cos^2 of
-    the angle to its
-    normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS are expected.
+    the angle to its normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS
+    are expected.
     """
     height, width = shape
     area_cm2 = width * height * (pixel_pitch_um * 1e-4) ** 2
@@ -170,8 +169,7 @@ class Detector:
         in the exposure.
 
         Raises InputError for a wrong shape, and for electrons or an exposure that are negative, not
-        finite or beyond
-        MAX_E.
+        finite or beyond MAX_E.
         """
         settings = self.settings
         light_e = self.collected_e(mean_e, exposure_s)
@@ -283,6 +281,7 @@ class Detector:
         return light_e
 
     def _check_light(self, light_e: npt.NDArray[Any]) -> None:
+        """Raise InputError for electrons that are negative, not a number, or too many."""
         if not light_e.min() >= 0:  # NaN propagates through min
             raise InputError(
                 "a pixel's electrons are negative or NaN; give expected electrons, 0 or more"
@@ -290,6 +289,7 @@ class Detector:
         self._check_largest(light_e)
 
     def _check_largest(self, expected_e: npt.NDArray[Any]) -> None:
+        """Raise InputError for more electrons in a pixel than can be drawn."""
         largest_e = expected_e.max()
         if not largest_e <= MAX_E:
             raise InputError(
@@ -298,6 +298,7 @@ class Detector:
             )
 
     def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:
+        """The charge that the wells hold, what exceeds them cut off or spilt along columns."""
         full_e = self.settings.full_well_e
         if self.settings.blooming:
             return bloom(collected_e, full_e)

@@ -7,11 +7,10 @@ bits. It becomes two independent normal numbers (Box and Muller 1958): the first
 electrons, the second the read noise.
 
 Electrons are the smallest count whose cumulative probability reaches that of the normal number.
-Below EXACT_BELOW_E
-that is exact (to float32's rounding of the number): a table or an expansion gives the count, and
-where either leaves a doubt, scipy's distribution decides. From there on the expansion alone decides
-(Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and Fisher's kind, with the 1/3 of a discrete law):
-its errors are in `tests/unit/tracker/test_frame_noise.py`.
+Below EXACT_BELOW_E that is exact (to float32's rounding of the number): a table or an expansion
+gives the count, and where either leaves a doubt, scipy's distribution decides. From there on the
+expansion alone decides (Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and Fisher's kind, with the
+1/3 of a discrete law): its errors are in `tests/unit/tracker/test_frame_noise.py`.
 """
 
 import os
@@ -38,8 +37,7 @@ ONE_STEP_SIGMAS = 3.0  # within it, a doubt is between two counts
 # Above this mean, the number of a step is straight between rows to 1.7e-3 sigmas.
 STRAIGHT_ABOVE_E, STEP_NUMBER_ERROR = 0.1, 2e-3
 # The expansion's error, e-, is at most ERROR_PER_BEND2 times the square of its last term ("bend"),
-# plus
-# ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus
+# plus ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus
 # FINER_ERROR_E / mean^1.5.
 ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
 FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
@@ -52,8 +50,7 @@ def normal_pairs(
     6.77 sigmas.
 
     Of words (n,), or of each part of words (parts, rows, width), the first half makes radii and the
-    second angles.
-    `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
+    second angles. `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
     """
     parts = words.shape[0] if words.ndim == 3 else 1
     halves = words.view(np.uint32).reshape(parts, 2, -1)
@@ -215,9 +212,8 @@ class CountTable(NamedTuple):
     """Counts by mean and normal number.
 
     `cells` (rows * COLUMNS,) holds the smallest count of a cell, with UNSURE where there are more;
-    `step_number`
-    ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at the means
-    between rows.
+    `step_number` ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at
+    the means between rows.
     """
 
     cells: npt.NDArray[np.uint8]
@@ -226,6 +222,7 @@ class CountTable(NamedTuple):
 
 @cache
 def _count_table() -> CountTable:
+    """The table for means under TABLE_BELOW_E, made once."""
     from scipy.special import ndtri, pdtr
 
     mean_e = np.arange(int(TABLE_BELOW_E) * ROWS_PER_E + 1) / ROWS_PER_E

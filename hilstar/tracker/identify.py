@@ -39,11 +39,13 @@ def wahba(seen: FloatArray, known: FloatArray, weight: FloatArray) -> FloatArray
 
     Wahba's problem by SVD (Markley 1988).
     """
-    profile = np.einsum("n,ni,nj->ij", weight / weight.sum(), seen, known)
+    share = weight / weight.sum()
+    profile = np.einsum("n,ni,nj->ij", share, seen, known)
     u, _, vt = np.linalg.svd(profile)
     # +1, or -1 where the product would be a reflection
     handedness = np.linalg.det(u) * np.linalg.det(vt)
-    return from_matrix(u @ np.diag([1.0, 1.0, handedness]) @ vt)
+    proper = np.diag([1.0, 1.0, handedness])
+    return from_matrix(u @ proper @ vt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,9 @@ def identify(
     weight = 1 / variance_px2
     q = q_expected
     for step, radius_px in enumerate(RADII_PX):
-        expected_px = np.stack(place(directions @ to_matrix(q).T), axis=1)
+        turned = directions @ to_matrix(q).T
+        expected_x, expected_y = place(turned)
+        expected_px = np.column_stack([expected_x, expected_y])
         inside = np.flatnonzero(np.isfinite(expected_px).all(axis=1))
         distance_px, neighbour = tree.query(expected_px[inside], distance_upper_bound=radius_px)
         is_near = np.isfinite(distance_px)
@@ -104,7 +108,8 @@ def identify(
         # they all moved alike: those that did not are others
         if step == 0 and len(pairs) >= MIN_STARS:
             moved_px = found_px[pairs] - expected_px[known]
-            apart_px = np.linalg.norm(moved_px - np.median(moved_px, axis=0), axis=1)
+            rest_px = moved_px - np.median(moved_px, axis=0)
+            apart_px = np.linalg.norm(rest_px, axis=1)
             alike = apart_px < RADII_PX[1]
             pairs = pairs[alike]
             known = known[alike]
@@ -124,7 +129,9 @@ def identify(
         known = known[is_close]
         q = wahba(found.rays[pairs], directions[known], weight[pairs])
     off_rad = _off_rad(found.rays[pairs], directions[known], q)
-    return Identified(q, pairs, star[known], float(np.sqrt(np.mean(off_rad**2) / 2)))
+    mean_square = np.mean(off_rad**2) / 2
+    rms_rad = float(np.sqrt(mean_square))
+    return Identified(q, pairs, star[known], rms_rad)
 
 
 def _off_rad(rays: FloatArray, directions: FloatArray, q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -160,7 +167,8 @@ class LostInSpace:
         self._camera = tetra3rs.CameraModel(
             focal_length_px=focal_length_px, image_width=width, image_height=height
         )
-        field_deg = float(np.degrees(2 * np.arctan(width / 2 / focal_length_px)))
+        half_tangent = width / 2 / focal_length_px
+        field_deg = float(np.degrees(2 * np.arctan(half_tangent)))
         order = np.argsort(v_mag, kind="stable")
         rows = np.zeros(len(order), dtype=GAIA_RECORD)
         x, y, z = directions[order].T
@@ -169,7 +177,9 @@ class LostInSpace:
         rows["ra"] = np.degrees(np.arctan2(y, x)) % 360
         rows["dec"] = np.degrees(np.arcsin(np.clip(z, -1, 1)))
         # tetra3rs's Gaia file: its mark, its version, the number of stars, and their rows
-        header = b"GDR3" + np.array([1], "<u4").tobytes() + np.array([len(rows)], "<u8").tobytes()
+        version = np.array([1], "<u4")
+        count = np.array([len(rows)], "<u8")
+        header = b"GDR3" + version.tobytes() + count.tobytes()
         with tempfile.TemporaryDirectory(prefix="hilstar-") as folder:
             path = Path(folder) / "stars.bin"
             path.write_bytes(header + rows.tobytes())

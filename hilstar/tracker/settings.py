@@ -25,8 +25,8 @@ E2V_DARK = {"ccd47-20": (1.14e6, 9080.0), "e2v-nimo": (122.0, 6400.0)}
 DATASHEET_RANGE_K = (230.0, 300.0)
 
 # More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their
-# rounding is 0.004
-# at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
+# rounding is 0.004 at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails
+# (9.2e18).
 MAX_E = 1e12
 
 Amount = Annotated[float, Meta(ge=0, le=MAX_E)]
@@ -247,9 +247,9 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     @property
     def reset_noise_e(self) -> float:
         """kTC noise: sqrt(k T C) / q, e-."""
-        return math.sqrt(
-            BOLTZMANN_EV_PER_K * self.temperature_k * self.sense_capacitance_ff * 1e-15 / ELECTRON_C
-        )
+        thermal_v = BOLTZMANN_EV_PER_K * self.temperature_k
+        squared_c = thermal_v * self.sense_capacitance_ff * 1e-15
+        return math.sqrt(squared_c / ELECTRON_C)
 
     def noise(self, light_e: npt.ArrayLike, exposure_s: float) -> PixelNoise:
         """The noise of pixels that light gives `light_e` electrons on average, background among
@@ -317,8 +317,12 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
 
     share, rate = points.reshape(-1, 2).T
     low = 0.0 if law == "normal" else 1e-9
-    is_rising = bool((np.diff(share) > 0).all() and (np.diff(rate) > 0).all())
-    if len(share) < 2 or not (share[0] > 0 and share[-1] < 1 and is_rising):
+    if len(share) < 2:
+        is_distribution = False
+    else:
+        is_rising = (np.diff(share) > 0).all() and (np.diff(rate) > 0).all()
+        is_distribution = bool(is_rising and share[0] > 0 and share[-1] < 1)
+    if not is_distribution:
         raise InputError(
             "dark_quantiles: write two points or more, shares between 0 and 1, both columns rising"
         )
@@ -365,7 +369,8 @@ def silicon_gap_ev(temperature_k: float) -> float:
 
 def _arrhenius(activation_ev: float, cold_k: float, warm_k: float) -> float:
     """The factor by which a process of an activation energy is faster at the warm temperature."""
-    return math.exp(activation_ev / BOLTZMANN_EV_PER_K * (1 / cold_k - 1 / warm_k))
+    inverse_k = 1 / cold_k - 1 / warm_k
+    return math.exp(activation_ev / BOLTZMANN_EV_PER_K * inverse_k)
 
 
 def check_value(name: str, value: Any, kind: Any) -> None:

@@ -31,7 +31,7 @@ BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centr
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
 GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
-MIN_BLUR_PX = 1e-3
+MIN_BLUR_PX = 1e-3  # in place of none, by which places would be divided
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class StarErrors:
         return float(np.hypot(*self.off_px[kind]).max())
 
     def worst(self) -> Centroider:
-        """Who is furthest off."""
+        """The centroider with the largest distance."""
         return max(self.off_px, key=self.max_px)
 
 
@@ -73,14 +73,14 @@ def _rms(errors: FloatArray) -> float:
 
 
 class Judge:
-    """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where
-    they should be.
+    """A tracker that measures the stars in the tiles of an image against the same stars in the
+    image that is wanted.
 
-    `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a
-    column of tiles at an
-    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in
-    monitor pixels, and `box_share` the threshold of its boxes. `phases` (count,) along x and y say
-    where in a tracker's pixel the stars of a column and of a row are, by default anywhere.
+    `wanted` (count * tile, count * tile) has one star near the middle of each tile: those of a
+    column of tiles at one x of `places_px`, those of a row at one y (count,). `sigma_px` (x, y) is
+    a star's; `blur_px` and `pixel_px` are the tracker's; all in monitor pixels. `box_share` is the
+    threshold of its boxes. `phases` (count,) along x and y say where in a tracker's pixel the stars
+    of a column and of a row are; by default they are spread evenly.
     """
 
     def __init__(
@@ -96,7 +96,10 @@ class Judge:
     ) -> None:
         self._box_share = box_share
         self._count = len(places_px[0])
-        self._phases = phases or (spread_phases(self._count),) * 2
+        if phases is None:
+            evenly = spread_phases(self._count)
+            phases = (evenly, evenly)
+        self._phases = phases
         self._tile = len(wanted) // self._count
         self._pixel_px = pixel_px
         tile_first_px = self._tile * np.arange(self._count)
@@ -132,12 +135,16 @@ class Judge:
         return StarErrors(np.asarray(magnitude(flux_ratio)), off_px)
 
     def _places_of(self, image: FloatArray, kind: Centroider) -> FloatArray:
-        """The stars' places (2, n), px, from where the tracker's pixel in the middle is."""
+        """The places (2, n), px, at which a centroider finds the stars, from the tracker's pixel in
+        the middle.
+        """
         if kind == "moment":  # no blur and no pixel changes it
             tiles = self._tiles(image, self._tile)
             at = np.arange(self._tile)
             light = np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
-            return np.stack([tiles.sum(axis=1) @ at / light, tiles.sum(axis=2) @ at / light])
+            x = tiles.sum(axis=1) @ at / light
+            y = tiles.sum(axis=2) @ at / light
+            return np.stack([x, y])
         boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
         stamps = self._seen(image, pixel_px)
@@ -209,7 +216,8 @@ def stamp_errors(
     phases = spread_phases(count)
     at = np.arange(side)
     light = wanted.sum(axis=(1, 2))
-    middle_x, middle_y = wanted.sum(axis=1) @ at / light, wanted.sum(axis=2) @ at / light
+    middle_x = wanted.sum(axis=1) @ at / light
+    middle_y = wanted.sum(axis=2) @ at / light
     sampled_px = max(pixel_px, FINEST_PX)
     blur_px = max(blur_px, MIN_BLUR_PX)
     shown_sigma = _shown_sigma(sigma_px, blur_px, sampled_px)
@@ -227,21 +235,27 @@ def stamp_errors(
     whole_wanted = seen(wanted, sampled_px, half)
     whole_shown = seen(shown, sampled_px, half)
     middle = np.full(count, half)
+    box_pixels = brightest(boxed_wanted)
     is_lit = shown.sum(axis=(1, 2)) > 0
     off_px: dict[Centroider, FloatArray] = {}
     for kind in FAMILY:
-        views, width_px, pixels = (whole_wanted, whole_shown), sampled_px, (middle, middle)
         if kind in BOXES:
-            views, width_px, pixels = (boxed_wanted, boxed_shown), pixel_px, brightest(boxed_wanted)
-        places = [star_places(view, kind, shown_sigma, pixels, box_share) for view in views]
-        wanted_px, shown_px = (np.stack(place) * width_px for place in places)
-        off_px[kind] = np.where(is_lit, shown_px - wanted_px, np.inf)
+            wanted_at = star_places(boxed_wanted, kind, shown_sigma, box_pixels, box_share)
+            shown_at = star_places(boxed_shown, kind, shown_sigma, box_pixels, box_share)
+            width_px = pixel_px
+        else:
+            wanted_at = star_places(whole_wanted, kind, shown_sigma, (middle, middle))
+            shown_at = star_places(whole_shown, kind, shown_sigma, (middle, middle))
+            width_px = sampled_px
+        error_px = np.stack(shown_at) * width_px - np.stack(wanted_at) * width_px
+        off_px[kind] = np.where(is_lit, error_px, np.inf)
     return off_px
 
 
 def spread_phases(count: int) -> FloatArray:
     """Places (count,) within a pixel, -0.5 to 0.5, spread evenly by the golden ratio."""
-    return np.asarray((np.arange(count) * GOLDEN) % 1.0 - 0.5)
+    turned = np.arange(count) * GOLDEN
+    return np.asarray(turned % 1.0 - 0.5)
 
 
 def _collected(
@@ -259,10 +273,10 @@ def _collected(
     tracker's pixels at its `phase` (n,).
     """
     steps = np.arange(-half, half + 1) + phase[:, None]
-    middles = star_px[:, None] + pixel_px * steps
+    middles = (star_px[:, None] + pixel_px * steps)[:, :, None]
     edges = np.arange(side + 1) - 0.5
-    to_left = middles[:, :, None] - pixel_px / 2 - edges
-    to_right = middles[:, :, None] + pixel_px / 2 - edges
+    to_left = middles - pixel_px / 2 - edges
+    to_right = middles + pixel_px / 2 - edges
     # Cumulative light of a blurred point up to a place, and the integral of that over a monitor
     # pixel.
     within = _ramp(to_right, blur_px) - _ramp(to_left, blur_px)

@@ -34,6 +34,8 @@ from tests.support.claims import faults, holds, rows
 from tools import claims as tool
 
 ROW = "star-places"
+# pages, tests, and the files that have what is given
+COPIED = ("docs/*.md", "tests/**/*.py", "hilstar/**/*.py", "tools/*.py", "configs/*.toml")
 
 
 def test_each_figure_its_row_and_its_test_belong_together():
@@ -96,7 +98,7 @@ def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """README, docs, rows, tests, and the files that have what is given."""
     folder = tmp_path_factory.mktemp("copy")
     names = ["README.md", "claims.toml"]
-    for pattern in ("docs/*.md", "tests/**/*.py", "hilstar/**/*.py"):
+    for pattern in COPIED:
         names += [path.relative_to(ROOT).as_posix() for path in ROOT.glob(pattern)]
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.display.exact import ALONE
+from hilstar.display.exact import Turn
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import shown_light
 from hilstar.display.render import apart
@@ -77,7 +77,7 @@ def test_each_primary_is_a_grey_monitor_of_its_light(quantisation, way, rng, mon
     assert levels[0].shape == (*SIZE[::-1], 3)
     for k in range(3):
         alone = [by_primary(sprites, STRIPES_PX, k) for sprites in frames]
-        grey = levels_of(target.of_primary(k), alone, way, monkeypatch)
+        grey = levels_of(target.of_primary(k, Turn()), alone, way, monkeypatch)
         for of_all, of_one in zip(levels, grey, strict=True):
             np.testing.assert_array_equal(of_all[..., k], of_one)
             assert of_one.any()
@@ -88,7 +88,7 @@ def test_in_exact_each_makes_up_for_what_those_before_left(way, rng, monkeypatch
     """Of a tracker of one channel, whose electrons are the sum of all three."""
     sprites = stars(rng)
     errors = []
-    for turns in (apart.turns_of, lambda target: dict.fromkeys(range(3), ALONE)):
+    for turns in (apart.turns_of, lambda target: dict.fromkeys(range(3), Turn())):
         monkeypatch.setattr(apart, "turns_of", turns)
         levels = levels_of(target_of("exact"), [sprites], way, monkeypatch)[0]
         light = shown_light(levels, Panel(GREY, WHITE, primaries=PANELS))

@@ -203,3 +203,13 @@ def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
     )
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
     assert np.abs(centroid_px(got) - centroid_px(truth)).max() < PLACE_LIMIT_PX
+
+
+def test_the_middle_of_a_small_disc_hides_all_that_is_behind_it():
+    """The Sun behind a Moon is 1e9 times white: what is left of it would be bright."""
+    (light,) = lights(moon_disc(6.0, 60.0, long_camera()), long_camera(), covers=True)
+    y, x = np.indices(light.cover.shape)
+    off_px = np.hypot(x + light.corner_px[0] - 30.3, y + light.corner_px[1] - 31.9)
+    assert (light.cover[off_px < 2.5] == 1).all() and (off_px < 2.5).sum() > 15
+    assert (light.cover[off_px > 10] < 1e-3).all()
+    assert light.cover.sum() == pytest.approx(np.pi * 6.0**2, rel=0.01)

@@ -108,6 +108,18 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
         assert (gl.levels() == plain).all()
 
 
+def test_a_floor_is_that_of_its_own_light(rng):
+    """Of two lights in turn, `exact` shows each as if it were the first."""
+    target = srgb_target("exact")
+    panel = target.panel()
+    with Renderer(target) as gl:
+        none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
+        for light in (map_of(rng), map_of(rng, 3e-3, 6e-3)):
+            gl.draw(replace(none, extended=(light,)))
+            # ties alone
+            assert np.mean(gl.levels() != dither_levels(gl.linear(), panel)) < 1e-4
+
+
 def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
     target = srgb_target("temporal")
     panel, light = target.panel(), map_of(rng)

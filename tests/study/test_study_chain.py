@@ -20,8 +20,8 @@ from hilstar.instruments.study import predictors
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain import glass as chain_glass
 from hilstar.instruments.study.chain.choices import (
+    ChainCombination,
     ChainScene,
-    Combination,
     Parts,
     five_scenes,
     lead_ns,
@@ -249,7 +249,7 @@ def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monk
     expected = np.sqrt(
         np.mean((3600 * late_s * np.linalg.norm(np.cross(true, predictors.AXIS), axis=1)) ** 2)
     )
-    held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
+    held = ChainCombination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
     assert scene.error(held).error_arcsec == pytest.approx(expected, rel=LATE_SHARE)
 
 
@@ -269,7 +269,7 @@ def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
 def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     scene, bench = scene_of(parts, 4), parts[0]
     (judge,) = scene.judges
-    held = Combination("exact", False, bench.faintest_v_mag, "full", "point", "held")
+    held = ChainCombination("exact", False, bench.faintest_v_mag, "full", "point", "held")
     image_e = scene.tracker.image_e(scene.chain(held).exposed(judge.seen), judge.seen)
     late = off(judge, judge.measure(image_e), judge.sky)
     dark = off(judge, judge.measure(np.zeros_like(image_e)), judge.sky)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import limits
-from hilstar.instruments.study.limits import Limit, limits_finding, run
+from hilstar.instruments.study.limits import StressLimit, limits_finding, run
 from tests.support.pictures import assert_drawn, table
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -62,7 +62,7 @@ def test_the_limits_are_those_that_hilstar_tells_elsewhere(study):
         _, error, meets, tolerance = limit_rows(rows, stress)
         assert math.isnan(meets) and (error < 1e-3 * tolerance).all()
     # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes
-    # (run/sync.py), to first order.
+    # (server/sync.py), to first order.
     at, error, _, _ = limit_rows(rows, limits.TURN)
     per_deg_s = 3600 / 60 * 0.3 * 0.7 / 2 / 6.3
     assert error == pytest.approx(per_deg_s * at, rel=0.02)
@@ -79,8 +79,8 @@ def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(study):
     assert 0.1 * widest_px < error[0] < 0.6 * widest_px
 
 
-def limit_of(errors, at=(1.0, 2.0, 4.0)) -> Limit:
-    return Limit(
+def limit_of(errors, at=(1.0, 2.0, 4.0)) -> StressLimit:
+    return StressLimit(
         "A method", limits.AGE, "packets over {} ms old", "px", np.array(at), np.array(errors)
     )
 

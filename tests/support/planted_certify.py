@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import datetime
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
-from hilstar.instruments.certify import assembly, certificate
+from hilstar.instruments.certify import assembly, certificate, structure
 from hilstar.instruments.certify.budget import BATCH
 from hilstar.instruments.certify.readings import ImageReader
 from hilstar.server.bench.bench_file import read_bench_file
@@ -34,7 +34,7 @@ from tests.support.planted_readings import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Collection
 
     from hilstar.server.bench.certificate_file import Certificate
 
@@ -202,6 +202,8 @@ def stated_directions() -> str:
     return f"[certify.tracker]\nname = 'planted'\n{expanded}\n"
 
 
+After = Callable[[int, dict[tuple[str, str], Counted]], None]
+
 # What a part of a certificate is read by; the figures that it tells.
 LIGHT, PLACE, DELAY = "light", "place", "delay"
 PARTS = {
@@ -218,9 +220,11 @@ def coverage(
     keys: str = "",
     tables: str = EXACT_LENS,
     parts: tuple[str, ...] = (LIGHT, PLACE, DELAY),
+    after: After | None = None,
 ) -> dict[tuple[str, str], Counted]:
     """Certify planted benches of a kind by their readings and count, by quantity and region.
 
+    `after` gets the number of benches and the counts after each.
     Of `parts` alone each bench's fits are made and its figures are counted: the others are the
     first bench's, which no figure of `parts` goes by.
     """
@@ -239,6 +243,7 @@ def coverage(
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
         # A certificate takes its first check, which is in no figure of it.
         patch.setattr(certificate, "take_check", lambda file, reader: None)
+        patch.setattr(structure, "_diagonal_in_time", _for_each(structure._diagonal_in_time))
         if LIGHT not in parts:
             patch.setattr(assembly, "light_deviation", _once(assembly.light_deviation))
             patch.setattr(assembly, "evenness", _once(assembly.evenness))
@@ -251,7 +256,22 @@ def coverage(
             one = draw(rng)
             certified, _ = certificate.certify(file, PlantedReader(one, rng), NOW, quick=True)
             count(certified, true_figures(one, stars), found, counted)
+            if after is not None:
+                after(number + 1, found)
     return dict(found)
+
+
+def _for_each(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of moments and a length that keeps its results: all benches have the same."""
+    results: dict[tuple[bytes, float], Any] = {}
+
+    def kept(t: np.ndarray, length: float) -> Any:
+        key = t.tobytes(), length
+        if key not in results:
+            results[key] = function(t, length)
+        return results[key]
+
+    return kept
 
 
 def _once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -270,7 +290,9 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 DETECTOR = "[tracker.detector]\nread_noise_e = 15\n"
 
 
-def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted]:
+def coverage_by_images(
+    benches: int, seed: int, after: After | None = None
+) -> dict[tuple[str, str], Counted]:
     """The same by images of the tracker, each drawn: the truth is a file, and hilstar's own twin
     draws it.
     """
@@ -297,6 +319,8 @@ def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted
                     )
             figures = [each for each in certified.figures if each.truth is not None]
             count(certified, {(each.quantity, each.star): each.truth for each in figures}, found)
+            if after is not None:
+                after(number + 1, found)
     return dict(found)
 
 

@@ -30,6 +30,7 @@ WORTH_A_GROUP_PX = 4096
 MAX_LISTED = 1 / 16
 LEAST_PX = 1e-6  # as in splat.frag
 MARGIN_PX = 0.001  # as in star.vert
+ROUNDED_DOWN = 1 - 1e-6  # float32 light times gain may be rounded up to the first threshold
 NOWHERE: IntArray = np.empty(0, dtype=np.intp)
 
 
@@ -100,10 +101,12 @@ def _places(
     """
     width, height = resolution_px
     step = np.arange(side) - (side - 1) // 2
-    place = np.add.outer(width * step, step).reshape(-1, 1) + (y * width + x)
+    in_square = np.add.outer(width * step, step).reshape(-1, 1)
+    place = in_square + (y * width + x)
     low = step[0]
     high = step[-1]
-    is_cut = (x + low < 0) | (x + high >= width) | (y + low < 0) | (y + high >= height)
+    is_cut = (x + low < 0) | (x + high >= width)
+    is_cut |= (y + low < 0) | (y + high >= height)
     if not is_cut.any():
         return place, None
     cut = np.flatnonzero(is_cut)
@@ -151,7 +154,7 @@ class CpuStars:
         self._most_gain = 1.0 if gain is None else float(gain.max())
         thresholds = RoundQuantiser.edges_e_per_s(panel)
         self._counter = ThresholdCounter(thresholds)
-        self._dark_e_per_s = float(thresholds[0]) / self._most_gain * (1 - 1e-6)
+        self._dark_e_per_s = float(thresholds[0]) / self._most_gain * ROUNDED_DOWN
         self._level_light = panel.light_e_per_s()
         self._axes_px2 = np.array(units.axes_px2, dtype=np.float32)
         self._drawn: IntArray | None = None  # places of the last frame's squares; None: anywhere
@@ -177,6 +180,7 @@ class CpuStars:
         self._drawn = NOWHERE
 
     def _images(self) -> list[npt.NDArray[Any]]:
+        """The levels and the sums, which a frame changes in the same places."""
         if self._fine_sums is None:
             fine = []
         else:
@@ -245,8 +249,10 @@ class CpuStars:
         """Which pixels (side, side, n) of squares lie within their stars' ellipses, as in
         splat.frag.
         """
-        away = squares.offset_px[:, None]
-        away_x, away_y = (np.abs(away - at) for at in squares.fraction_px)
+        offset_px = squares.offset_px[:, None]
+        x_px, y_px = squares.fraction_px
+        away_x = np.abs(offset_px - x_px)
+        away_y = np.abs(offset_px - y_px)
         up = away_y / np.maximum(reach_px[1], np.float32(LEAST_PX))
         wide = reach_px[0] * np.sqrt(np.maximum(1 - up * up, np.float32(0)))
         wide[away_y > reach_px[1]] = -1.0

@@ -159,6 +159,14 @@ def sprites_array(program: moderngl.Program, buffer: moderngl.Buffer) -> moderng
     return program.ctx.vertex_array(program, [(buffer, " ".join(layout), *names)])
 
 
+def viewport_of_sprites(size_px: tuple[int, int], footprint_px: int) -> Rectangle:
+    """The viewport of star.vert: a footprint beyond every edge, for GL drops a point whose centre
+    is outside it.
+    """
+    width, height = size_px
+    return -footprint_px, -footprint_px, width + 2 * footprint_px, height + 2 * footprint_px
+
+
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
     """Set the sides of fainter stars' sprites, by falling rates, in a program of star.vert.
 
@@ -186,8 +194,11 @@ def lit_sides(
         light = lit_e_per_s / float(gain.max())
     sizes = range(psf.footprint_px - 2, 0, -2)
     every = -(-len(sizes) // MAX_SIDES) or 1
-    rates = {size: light / wings / psf.outside_share(size) for size in sizes[::every]}
-    return tuple(SpriteSide(min(rate, MAX_RATE), size) for size, rate in rates.items())
+    sides = []
+    for size in sizes[::every]:
+        below_e_per_s = light / wings / psf.outside_share(size)
+        sides.append(SpriteSide(min(below_e_per_s, MAX_RATE), size))
+    return tuple(sides)
 
 
 def most_covered_px(sprites: FrameLight, footprint_px: int, sides: SpriteSides, few_px: int) -> int:
@@ -240,7 +251,8 @@ class Eraser:
             return
         fbo.use()
         width, height = self._size_px
-        if sum(wide * high for _, _, wide, high in regions) >= self._most_share * width * height:
+        erased_px = sum(wide * high for _, _, wide, high in regions)
+        if erased_px >= self._most_share * width * height:
             fbo.clear()
             return
         for region in regions:
@@ -264,13 +276,11 @@ class Eraser:
         """Make `fbo` black where the first `count` sprites of the buffer are; all of it where
         that is not known.
         """
-        width, height = self._size_px
         fbo.use()
         if self.clears(count):
             fbo.clear()
         elif count and self._vao is not None:
-            margin = self._footprint_px
-            fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+            fbo.viewport = viewport_of_sprites(self._size_px, self._footprint_px)
             self._vao.render(moderngl.POINTS, vertices=count)
 
 
@@ -512,13 +522,13 @@ class Encoder:
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
         if count and self._sprite_vao is not None:
             self.sprite_program["sprites_per_star"] = float(per_star)
-            margin = self._footprint_px
-            self._fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+            self._fbo.viewport = viewport_of_sprites(self._size_px, self._footprint_px)
             self._sprite_vao.render(moderngl.POINTS, vertices=count)
         if tiles is not None:
             self._draw_tiles(tiles, uniforms)
 
     def _bind(self) -> None:
+        """Bind the linear image and the tables for the next pass."""
         for unit, texture in enumerate(self._textures.values()):
             texture.use(unit)
         if self._linear_image is not None:
@@ -527,6 +537,7 @@ class Encoder:
             block.bind_to_uniform_block(place)
 
     def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
+        """Encode tiles: of the linear image where it has them, of their own light, or white."""
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = (
@@ -549,6 +560,7 @@ class Encoder:
 
 
 def _rows(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Values (n,) in rows of TABLE_WIDTH, with 0 after the last."""
     rows = -(-len(values) // TABLE_WIDTH)
     padded = np.zeros((rows, TABLE_WIDTH), dtype=values.dtype)
     padded.ravel()[: len(values)] = values

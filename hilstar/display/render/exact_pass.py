@@ -36,9 +36,13 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
-PARTS = tuple(
-    f"{one}.glsl"
-    for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")
+PARTS = (
+    "floor.glsl",
+    "exact/inputs.glsl",
+    "shares.glsl",
+    "exact/stars.glsl",
+    "exact/pixels.glsl",
+    "exact/choices.glsl",
 )
 LOCAL_SIZE = 32  # as in exact.comp
 TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 3, 7, 8
@@ -117,11 +121,9 @@ class ExactPass:
         self._order = LookupTable(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
         self._light = LookupTable(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
         gain = panel.gain()
-        self._gain = (
-            None
-            if gain is None
-            else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
-        )
+        self._gain: moderngl.Texture | None = None
+        if gain is not None:
+            self._gain = ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._memory = Memory(ctx) if quantiser.remembers else None
         self._step_e_per_s = float(light[1])
         self._turns = ctx.buffer(reserve=4, dynamic=True)
@@ -134,11 +136,18 @@ class ExactPass:
         """The program for stars or paths, whose light is summed, on a `floor` of levels or not,
         or in the linear image.
         """
-        if (paths, summed, floor) in self._programs:
-            return self._programs[paths, summed, floor]
+        key = paths, summed, floor
+        if key not in self._programs:
+            program = self._build(paths, summed, floor)
+            self._shares.set(program)
+            for values in (self._reach(paths), self._light_of_panel(), self._weights()):
+                set_uniforms(program, values)
+            self._programs[key] = program
+        return self._programs[key]
+
+    def _build(self, paths: bool, summed: bool, floor: bool) -> moderngl.ComputeShader:
+        """The program, without the values of its uniforms."""
         order = self._pixels
-        panel = self._panel
-        balance = self._balance
         before = 0 if paths else len(self._before)
         defines = [
             f"NEAR {order.near}",
@@ -153,51 +162,61 @@ class ExactPass:
             *self._order.define,
             *self._light.define,
         ]
-        narrow = min(balance.psf.width_px) < NARROW_PX
-        uneven = self._gain is not None
         whether = {
             "LEAVES": self._turn.is_followed and not paths,
-            "NARROW": narrow,
+            "NARROW": min(self._balance.psf.width_px) < NARROW_PX,
             "PATHS": paths,
-            "UNIFORMITY": uneven,
+            "UNIFORMITY": self._gain is not None,
             "TEMPORAL": self._memory is not None,
             "SUMS": summed,
             "FLOOR": floor,
         }
         defines += [name for name, is_so in whether.items() if is_so]
         files = (*["sums.glsl"] * summed, *PARTS)
-        program = build_compute(self._ctx, self._quantiser.shader, defines, files)
-        self._shares.set(program)
-        window = balance.window_px
-        weights = balance.weights
-        values: dict[str, Any] = {
+        return build_compute(self._ctx, self._quantiser.shader, defines, files)
+
+    def _reach(self, paths: bool) -> dict[str, Any]:
+        """Uniforms: which pixels are a star's, and how many of them are chosen."""
+        order = self._pixels
+        psf = self._balance.psf
+        least_e_per_s = order.area_px2 * LEAST_LIGHT * float(self._panel.light_e_per_s()[1])
+        variance_x, variance_y = psf.variance_px2
+        return {
             "footprint": order.size**2,
-            "overrated": overrated(balance.psf.width_px) if paths else OVERRATED,
+            "overrated": overrated(psf.width_px) if paths else OVERRATED,
             "reach_px2": order.area_px2,
-            "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
+            "reach_per_e": 1 / least_e_per_s,
             "fewest": self._quantiser.fewest(order),
-            "white": panel.response.white,
-            "first_threshold_e_per_s": float(
-                panel.response.threshold[0] * panel.flux_at_white_e_per_s
-            ),
             "resolution_px": self._linear.size,
             "odd": order.bias,
-            "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
-            "half_inverse_spread2": tuple(0.5 / variance for variance in balance.psf.variance_px2),
+            "half_inverse_spread2": (0.5 / variance_x, 0.5 / variance_y),
+        }
+
+    def _light_of_panel(self) -> dict[str, Any]:
+        """Uniforms: the panel's levels, and the unit of its gain, which is bound there."""
+        panel = self._panel
+        threshold = panel.response.threshold[0]
+        return {
+            "white": panel.response.white,
+            "first_threshold_e_per_s": float(threshold * panel.flux_at_white_e_per_s),
+            "gain": 0,
+        }
+
+    def _weights(self) -> dict[str, Any]:
+        """Uniforms: the weights of the ten sums."""
+        balance = self._balance
+        weights = balance.weights
+        sigma_x, sigma_y = balance.window_px
+        of_all = weights.light, weights.moments
+        under_window = weights.window_light, weights.window_moments
+        return {
+            "half_inverse_window2": (0.5 / sigma_x**2, 0.5 / sigma_y**2),
             "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
             "follows": (*balance.follows(3), *balance.follows(5)),
-            "weights": (
-                weights.light,
-                weights.moments,
-                weights.window_light,
-                weights.window_moments,
-            ),
+            "weights": (*of_all, *under_window),
             "few_steps": weights.few_steps,
             "last_light": weights.last_light,
-        } | ({"gain": 0} if self._gain is not None else {})
-        set_uniforms(program, values)
-        self._programs[paths, summed, floor] = program
-        return program
+        }
 
     @property
     def left(self) -> Left | None:
@@ -287,9 +306,9 @@ class Memory:
         self._ctx = ctx
         self._star: IntArray | None = None  # the last frame's stars
         self._room = 0
-        self._begins, self._before, self._left = (
-            self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,))
-        )
+        self._begins = self._reserved(BEGIN_DTYPE.itemsize)
+        self._before = self._reserved(SUMS_BYTES)
+        self._left = self._reserved(SUMS_BYTES)
 
     def _reserved(self, size: int) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=max(self._room, 1) * size, dynamic=True)
@@ -312,10 +331,9 @@ class Memory:
             self._left.release()
             self._left = self._reserved(SUMS_BYTES)
         self._begins.write(begins)
-        for place, buffer in enumerate(
-            (self._begins, self._before, self._left), start=FIRST_BINDING
-        ):
-            buffer.bind_to_storage_buffer(place)
+        self._begins.bind_to_storage_buffer(FIRST_BINDING)
+        self._before.bind_to_storage_buffer(FIRST_BINDING + 1)
+        self._left.bind_to_storage_buffer(LEFT_BINDING)
         self._star = star.copy()
 
     @property
@@ -323,9 +341,8 @@ class Memory:
         """The errors of the last frame, read back; None at the beginning of a sequence."""
         if self._star is None:
             return None
-        sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(
-            -1, SUMS
-        )
+        data = self._left.read(len(self._star) * SUMS_BYTES)
+        sums = np.frombuffer(data, dtype="<f4").reshape(-1, SUMS)
         return Left(self._star, np.ascontiguousarray(sums.T))
 
     @left.setter
@@ -344,10 +361,10 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     bits each, then the pixel's shares of the 3 x 3 and the 5 x 5 box in 10 bits each.
     """
     x, y = order.places()
-    away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
-    box_3, box_5 = (
-        np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5)
-    )
+    middle_x, middle_y = np.rint(order.phases)
+    away = x - middle_x[:, None], y - middle_y[:, None]
+    box_3 = np.rint(balance.in_box(3, *away) * IN_BOX).astype(np.intp)
+    box_5 = np.rint(balance.in_box(5, *away) * IN_BOX).astype(np.intp)
     packed = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
     return np.asarray(packed, dtype=np.uint32)
 
@@ -363,10 +380,13 @@ def overrated(width_px: tuple[float, float]) -> float:
     if min(width_px) < NARROW_PX:
         return OVERRATED
     away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
-    along_x, along_y = (_largest_ratios(away, width) for width in width_px)
+    along_x = _largest_ratios(away, width_px[0])
+    along_y = _largest_ratios(away, width_px[1])
+    # how far along y a pixel within reach may be
     rest = np.sqrt(REACH_SIGMA**2 - away**2)
-    along_rest = along_y[np.searchsorted(away, rest, side="right") - 1]
-    return OVERRATED * float((along_x * along_rest).max())
+    last = np.searchsorted(away, rest, side="right") - 1
+    ratios = along_x * along_y[last]
+    return OVERRATED * float(ratios.max())
 
 
 def _largest_ratios(places: FloatArray, width_px: float) -> FloatArray:
@@ -380,8 +400,10 @@ def _ratio(place: float, width_px: float) -> float:
     `place` wide sigmas off.
     """
     wide = math.sqrt(width_px**2 + PIXEL_VARIANCE)
-    edges = [(place * wide + side) / (width_px * math.sqrt(2)) for side in (-0.5, 0.5)]
-    light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
+    scale = width_px * math.sqrt(2)
+    below = math.erf((place * wide - 0.5) / scale)
+    above = math.erf((place * wide + 0.5) / scale)
+    light = (above - below) / 2
     return math.exp(-(place**2) / 2) / (math.sqrt(math.tau) * wide * light)
 
 
@@ -393,11 +415,13 @@ def stretches_of(star: IntArray) -> IntArray:
     ends = np.append(begins[1:], len(star))
     parts = -(-(ends - begins) // CARRIED)
     path = np.repeat(np.arange(len(begins)), parts)
-    number = np.arange(len(path)) - np.repeat(np.cumsum(parts) - parts, parts)
-    first = begins[path] + number * CARRIED
-    return np.stack(
-        [first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1
-    )
+    first_of_path = np.cumsum(parts) - parts
+    number = np.arange(len(path)) - np.repeat(first_of_path, parts)
+    path_begin = begins[path]
+    path_end = ends[path]
+    first = path_begin + number * CARRIED
+    end = np.minimum(first + CARRIED, path_end)
+    return np.stack([first, end, path_begin, path_end], axis=1)
 
 
 def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
@@ -411,11 +435,9 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
     runs = max(1, min(count // RUN, MAX_RUNS))
     # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows
     # by a pixel or two.
-    half_octaves = (electrons_per_s.view(np.int32) >> 22) - (
-        np.float32(step_e_per_s).view(np.int32) >> 22
-    )
-    key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(
-        half_octaves, 0, HALF_OCTAVES - 1
-    )
+    first_half_octave = np.float32(step_e_per_s).view(np.int32) >> 22
+    half_octaves = (electrons_per_s.view(np.int32) >> 22) - first_half_octave
+    run = np.arange(count) * runs // max(count, 1)
+    key = run * HALF_OCTAVES + np.clip(half_octaves, 0, HALF_OCTAVES - 1)
     # 16-bit keys are sorted by radix
     return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))

@@ -29,6 +29,8 @@ WINGS, DENSER_WINGS = 128, 8
 # 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
+# float32 light may be rounded up by 1e-7 of it, star by star: the bound of a sum must not be passed
+ROUNDED_UP = 1.000001
 
 
 class LightUnits:
@@ -57,14 +59,13 @@ class LightUnits:
         # what part of the light that lights a pixel the squares leave out beside them at most: one
         # in so many
         if sides:
-            outside = [
-                self.lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px))
-                for side in sides
-            ]
-            fewest = min(
-                [wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS
-            )
-            self.wings = SQUARE_WINGS * max(1.0, fewest)
+            fewest = []
+            for side in sides:
+                outside_e_per_s = side.below_e_per_s * psf.outside_share(side.side_px)
+                wings = self.lit_e_per_s / outside_e_per_s
+                if wings > ANY_RATE:
+                    fewest.append(wings)
+            self.wings = SQUARE_WINGS * max(1.0, min(fewest, default=WINGS / SQUARE_WINGS))
         self.side_px = max((side.side_px for side in sides), default=self._footprint_px)
 
     def unit_for(self, sprites: FrameLight | None) -> float | None:
@@ -86,7 +87,8 @@ class LightUnits:
             return self.most_e_per_s
         white_e_per_s = np.float32(self.most_e_per_s / self._peak_share)
         rates = np.minimum(sprites.data["electrons_per_s"], white_e_per_s)
-        most_e_per_s = float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001
+        total_e_per_s = float(rates.sum(dtype=np.float64))
+        most_e_per_s = total_e_per_s * self._peak_share * ROUNDED_UP
         most_e_per_s = max(most_e_per_s, self.most_e_per_s)
         room = max_sum - len(sprites)
         exponent = math.ceil(math.log2(most_e_per_s / room))

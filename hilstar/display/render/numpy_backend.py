@@ -94,6 +94,15 @@ def _say_once(why: str) -> None:
     )
 
 
+def _exact_quantisers(backends: Sequence[Backend]) -> list[ExactQuantiser]:
+    """The quantisers of backends that choose a star's levels together."""
+    quantisers = []
+    for backend in backends:
+        if isinstance(backend, NumpyBackend) and isinstance(backend._quantiser, ExactQuantiser):
+            quantisers.append(backend._quantiser)
+    return quantisers
+
+
 class NumpyBackend(Backend):
     """Draws sprites of one grey Target in NumPy; `back_buffer` has the codes (height, width, 3)
     that were presented.
@@ -115,9 +124,8 @@ class NumpyBackend(Backend):
             kind = QUANTISERS[target.quantisation]
             self._quantiser = kind(panel, target.resolution_px, target.psf, target.seen)
         if isinstance(self._quantiser, ExactQuantiser):
-            others = [backend._quantiser for backend in before if isinstance(backend, NumpyBackend)]
             self._quantiser.turn = target.turn
-            self._quantiser.before = [one for one in others if isinstance(one, ExactQuantiser)]
+            self._quantiser.before = _exact_quantisers(before)
         self.path = "NumPy"
         self._stars: CpuStars | None = None
         self._level_image = np.empty((0, 0), dtype=np.uint8)

@@ -1,5 +1,6 @@
 """The last pass: the levels of a renderer onto the window that its context belongs to."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,18 +57,15 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
     All are drawn side by side and read back. It overwrites the back buffer, and swaps nothing.
     """
     codes = np.arange(2**bits, dtype=np.uint16)
-    triples = np.concatenate(
-        [np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()]
-    )
+    parts = [np.outer(codes, primaries) for primaries in PRIMARIES.values()]
+    triples = np.concatenate(parts).astype(np.uint16)
     width, height = screen_px
+    pixels = np.arange(width * height, dtype=np.uint32)
+    at_once = min(MAX_LEVELS, width * height)
     wrong = 0
     first = ""
-    for part in np.array_split(triples, -(-len(triples) // min(MAX_LEVELS, width * height))):
-        levels = (
-            (np.arange(width * height, dtype=np.uint32) % len(part))
-            .astype(np.uint16)
-            .reshape(height, width)
-        )
+    for part in np.array_split(triples, math.ceil(len(triples) / at_once)):
+        levels = (pixels % len(part)).astype(np.uint16).reshape(height, width)
         with context:
             texture = level_texture(context, levels)
             Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
@@ -75,14 +73,15 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             _ = context.error
             texture.release()
-        drawn = np.rint(
-            np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1]
-        )
+        # GL counts rows from the bottom
+        shares = np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1]
+        drawn = np.rint(shares * codes[-1])
         differ = (drawn != part[levels]).any(axis=-1)
         changed = np.unique(levels[differ])
         if len(changed) and not wrong:
             became = drawn[(levels == changed[0]) & differ][0].astype(int)
-            first = f"{tuple(map(int, part[changed[0]]))} as {tuple(map(int, became))}"
+            wanted = part[changed[0]]
+            first = f"{tuple(wanted.tolist())} as {tuple(became.tolist())}"
         wrong += len(changed)
     if wrong:
         return f"{wrong} of {len(triples)} codes are not drawn as they are, {first}"

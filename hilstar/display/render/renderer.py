@@ -42,6 +42,7 @@ from hilstar.display.render.encoder import (
     set_uniforms,
     splat_program,
     sprites_array,
+    viewport_of_sprites,
 )
 from hilstar.display.render.exact_pass import ExactPass, PixelSums
 from hilstar.display.render.light_units import LightUnits
@@ -80,16 +81,13 @@ class Renderer(Backend):
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
         self._by_pixel = quantiser.by_pixel()
-        self._by_star = (
-            quantiser
-            if target.response is not None and issubclass(quantiser, ExactQuantiser)
-            else None
-        )
+        self._by_star: type[ExactQuantiser] | None = None
+        if target.response is not None and issubclass(quantiser, ExactQuantiser):
+            self._by_star = quantiser
         self._last_frame = NO_FRAME
         self.context = self._ctx = context or create_context()
-        self.gl_renderer, self.gl_version = (
-            str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION")
-        )
+        self.gl_renderer = str(self._ctx.info["GL_RENDERER"])
+        self.gl_version = str(self._ctx.info["GL_VERSION"])
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
@@ -110,6 +108,7 @@ class Renderer(Backend):
             raise
 
     def _build(self) -> None:
+        """Make images and programs; those of levels only where there is a response."""
         ctx = self._ctx
         target = self.target
         ctx.enable(moderngl.PROGRAM_POINT_SIZE)
@@ -135,6 +134,7 @@ class Renderer(Backend):
         self._is_cpu_image = False  # where the last draw is
 
     def _build_levels(self) -> None:
+        """Make what turns light into levels, and choose the path of frames of stars alone."""
         target = self.target
         panel = self._panel
         # What turns light into codes; a window adds its own.
@@ -334,11 +334,8 @@ class Renderer(Backend):
 
     def _draw_by_points(self, sprites: FrameLight | None, unit_e_per_s: float | None) -> None:
         """The linear image and its levels by rasterised sprites, in units where one is given."""
-        few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
-        if self._encoder is not None:
-            sides = self._lit_sides
-        else:
-            sides = ()
+        few_px = math.prod(self.target.resolution_px) // SPRITE_PIXEL_COST
+        sides = () if self._encoder is None else self._lit_sides
         if sprites is None:
             covered_px = 0
         else:
@@ -510,19 +507,14 @@ class Renderer(Backend):
                 self._buffer.orphan()
                 self._buffer.write(sprites.data)
             self._last_count = len(sprites)
-            width, height = self.target.resolution_px
-            margin = self.footprint_px
             with self._stage("splat"):
                 if not in_units:
                     self._splat["sides"] = 0 if whole else len(self._cut_sides)
                     self._splat["sprites_per_star"] = float(sprites.per_star)
                 self._linear_fbo.use()
                 self._shares.bind()
-                self._linear_fbo.viewport = (
-                    -margin,
-                    -margin,
-                    width + 2 * margin,
-                    height + 2 * margin,
+                self._linear_fbo.viewport = viewport_of_sprites(
+                    self.target.resolution_px, self.footprint_px
                 )
                 self._ctx.enable(moderngl.BLEND)
                 vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao

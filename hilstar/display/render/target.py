@@ -7,7 +7,7 @@ import numpy as np
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.display.balance import AS_USUAL, Seen
-from hilstar.display.exact import ALONE, Turn
+from hilstar.display.exact import Turn
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import Quantisation
 from hilstar.display.response import Response
@@ -51,7 +51,7 @@ class Target:
     primaries: tuple[Panel, ...] = ()
     places_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     together: FloatArray = field(default_factory=lambda: np.eye(1))
-    turn: Turn = ALONE
+    turn: Turn = field(default_factory=Turn)
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""
@@ -66,7 +66,7 @@ class Target:
             )
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
-    def of_primary(self, k: int, turn: Turn = ALONE) -> "Target":
+    def of_primary(self, k: int, turn: Turn) -> "Target":
         """The target of primary `k` alone: a grey monitor with that primary's light."""
         panel = self.primaries[k]
         # the sides are by stars' rates of white

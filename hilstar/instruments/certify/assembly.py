@@ -28,8 +28,9 @@ def read_bench(file: BenchFile, reader: Reader) -> Read:
     InputError, MachineError.
     """
     certify = file.config.certify
+    white = 2**file.config.monitor.bits - 1
     rng = np.random.default_rng(SEED)
-    codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
+    codes = planned_codes(white, certify.levels, certify.repeats, rng)
     light = light_deviation(file, reader.light(codes))
     dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
     place = lens_fit(file, dots, place_errors(file, dots))
@@ -88,10 +89,11 @@ class _BenchModel:
         )
         count = len(self.figures.stars)
         of_bench = self.figures.of(off)
-        own = of_bench[:, : len(SKY) * count].reshape(-1, len(SKY), count)
-        of_stars = self._moved(own, "sky", variables)
+        shown = of_bench[:, : len(SKY) * count].reshape(-1, len(SKY), count)
+        of_stars = self._moved(shown, "sky", variables)
         of_stars[:, FLUX] += [star.quantised_mag for star in self.figures.stars]
-        return np.concatenate([of_bench, of_stars.reshape(len(of_bench), -1)], axis=1)
+        columns = of_stars.reshape(len(of_bench), -1)
+        return np.concatenate([of_bench, columns], axis=1)
 
     def _moved(self, value: FloatArray, kind: str, variables: list[FloatArray]) -> FloatArray:
         """A deviation (1 or b, ...) with what all inputs add to it (b, ...)."""

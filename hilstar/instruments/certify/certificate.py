@@ -115,42 +115,53 @@ def certify(
     drawn = by_trials(budget.model, budget.inputs, np.random.default_rng(SEED), max_trials)
     truth = None
     if reader is not None and reader.truth is not None:
-        truth = budget.figures.of(true_deviations(budget.figures, reader.truth))[0]
+        true = true_deviations(budget.figures, reader.truth)
+        truth = budget.figures.of(true)[0]
     figures = list(_figures(file, budget, combined, drawn, truth))
     judged = [figure.conforms for figure in figures if figure.conforms is not None]
     settings = file.config.certify
     files = files_of(file)
     utc = now.astimezone(datetime.UTC)
     made = utc.isoformat(timespec="seconds")
-    core = msgspec.json.encode([file.sha256, files, made, figures])
-    settings_of = msgspec.to_builtins(file.config.collimator)
-    settings_of["file"] = file.config.collimator.geometry
+    core = sha256_of(msgspec.json.encode([file.sha256, files, made, figures]))
+    expires = utc.date() + datetime.timedelta(days=settings.valid_days)
+    collimator = msgspec.to_builtins(file.config.collimator)
+    collimator["file"] = file.config.collimator.geometry
+    instrument = {}
+    if settings.instrument.name:
+        instrument = msgspec.to_builtins(settings.instrument)
+    reference_sha256 = None
+    if reference is not None:
+        reference_sha256 = sha256_of(reference)
+    conforms = None
+    if judged:
+        conforms = all(judged)
     certificate = Certificate(
         kind=KIND,
-        number=f"H{made[:10].replace('-', '')}-{sha256_of(core)[:8]}",
+        number=f"H{made[:10].replace('-', '')}-{core[:8]}",
         made=made,
-        valid_until=(utc.date() + datetime.timedelta(days=settings.valid_days)).isoformat(),
+        valid_until=expires.isoformat(),
         hilstar=__version__,
         bench=file.path.name,
         bench_sha256=file.sha256,
         files=files,
         monitor=_monitor(file, monitor),
-        collimator={key: value for key, value in settings_of.items() if value is not None},
+        collimator={key: value for key, value in collimator.items() if value is not None},
         read_by=read_by,
         who=settings.who,
         where=settings.where,
         ambient=settings.ambient,
         traceability=settings.traceability,
-        instrument=msgspec.to_builtins(settings.instrument) if settings.instrument.name else {},
+        instrument=instrument,
         decision=settings.decision,
-        conforms=all(judged) if judged else None,
+        conforms=conforms,
         trials=drawn.trials,
         two_digits_stand=drawn.settled,
         inputs=[_input_row(budget_input) for budget_input in budget.inputs],
         figures=figures,
         not_assessed=[*budget.not_assessed, *_never_assessed(settings)],
         measurands=MEASURANDS,
-        reference_sha256=None if reference is None else sha256_of(reference),
+        reference_sha256=reference_sha256,
         replaces=replaces,
     )
     certificate = msgspec.structs.replace(certificate, cube=cube_to_boresight(file, certificate))
@@ -211,7 +222,9 @@ def _figures(
         k = 0.0
         if standard:
             k = float(combined.upper[number] - value) / standard
-        dof = float(combined.dof[number])
+        dof = None
+        if combined.dof[number] < MAX_DOF:
+            dof = round(float(combined.dof[number]), 1)
         limit, conforms = _judged(file, quantity, value, (lower, upper))
         true = None
         if truth is not None and number < len(truth):
@@ -227,7 +240,7 @@ def _figures(
             lower=_rounded(lower),
             upper=_rounded(upper),
             unit=unit,
-            dof=round(dof, 1) if dof < MAX_DOF else None,
+            dof=dof,
             limit=limit,
             conforms=conforms,
             truth=true,
@@ -276,11 +289,12 @@ def _contributions(inputs: list[Input], shares: FloatArray) -> list[Contribution
     total = max(float((shares**2).sum()), SMALLEST)
     contributions = []
     for k in np.argsort(-shares, kind="stable"):
-        if shares[k] > 0:
+        size = float(shares[k])
+        if size > 0:
             contribution = Contribution(
                 input=inputs[k].name,
-                standard_uncertainty=_rounded(float(shares[k])),
-                share=round(float(shares[k] ** 2 / total), 4),
+                standard_uncertainty=_rounded(size),
+                share=round(size**2 / total, 4),
             )
             contributions.append(contribution)
     return contributions

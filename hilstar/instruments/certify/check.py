@@ -9,7 +9,9 @@ raise a false alarm once in 10 000 checks (Bonferroni).
 import csv
 import datetime
 import io
+import itertools
 import math
+import operator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Self
@@ -113,7 +115,8 @@ def take_check(file: BenchFile, reader: Reader) -> CheckReadings:
     """Read a bench as a check does. Raises InputError, MachineError."""
     white = 2**file.config.monitor.bits - 1
     faintest = max(white * FAINTEST_SHARE, 1)
-    lit = np.unique(np.rint(np.geomspace(faintest, white, PATCHES - 1)).astype(np.intp))
+    steps = np.rint(np.geomspace(faintest, white, PATCHES - 1))
+    lit = np.unique(steps.astype(np.intp))
     planned = np.repeat(np.append(0, lit), REPEATS)
     light = reader.light(np.random.default_rng(PATCHES).permutation(planned))
     dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
@@ -169,8 +172,10 @@ def compare(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[Che
     in common.
     """
     changes = [*_light(was, now), *_geometry(file, was, now)]
-    psf_u = 100 * math.hypot(was.psf_u_px, now.psf_u_px) / was.psf_px
-    changes.append(_Change("psf", 100 * (now.psf_px / was.psf_px - 1), psf_u, ALARMED_DOF))
+    to_percent = 100 / was.psf_px
+    wider = to_percent * (now.psf_px - was.psf_px)
+    psf_u = to_percent * math.hypot(was.psf_u_px, now.psf_u_px)
+    changes.append(_Change("psf", wider, psf_u, ALARMED_DOF))
     if was.delay_ms is not None and now.delay_ms is not None:
         both = math.hypot(was.delay_u_ms, now.delay_u_ms)
         dof = float(max(min(was.delay_dof, now.delay_dof), 1))
@@ -225,7 +230,7 @@ class _Codes:
     """
 
     mean: FloatArray
-    count: IntArray
+    count: FloatArray
     squares: FloatArray
 
     @classmethod
@@ -234,11 +239,17 @@ class _Codes:
         _, place, count = np.unique(readings.code, return_inverse=True, return_counts=True)
         light = np.array(readings.light)
         mean = np.bincount(place, light) / count
-        squares = np.bincount(place, (light - mean[place]) ** 2)
-        return cls(mean, count, squares)
+        squares = np.bincount(place, (light - mean[place]) ** 2).astype(np.float64)
+        return cls(mean, count.astype(np.float64), squares)
+
+    @property
+    def freedom(self) -> FloatArray:
+        """The freedom (k,) of the squares."""
+        return self.count - 1
 
     @property
     def is_noisy(self) -> bool:
+        """Whether readings scatter."""
         return bool(self.squares.sum() > 0)
 
 
@@ -254,21 +265,27 @@ class _Noise:
     def of(cls, codes: IntArray, noisy: list[_Codes]) -> Self:
         """The noise by the scatter of those readings that have some."""
         is_bright = codes > codes[len(codes) // 3]
-        dof = float(sum((of.count - 1)[is_bright].sum() for of in noisy))
-        squares = sum((of.squares / of.mean**2)[is_bright].sum() for of in noisy)
+        dof = squares = 0.0
+        for of in noisy:
+            relative_squares = of.squares / of.mean**2
+            squares += float(relative_squares[is_bright].sum())
+            dof += float(of.freedom[is_bright].sum())
         relative = 0.0
         if dof:
-            relative = math.sqrt(float(squares) / dof)
+            relative = math.sqrt(squares / dof)
         excess = freedom = 0.0
         for of in noisy:
-            beyond = of.squares - (of.count - 1) * (relative * of.mean) ** 2
+            by_light = of.freedom * (relative * of.mean) ** 2
+            beyond = of.squares - by_light
             excess += float(beyond[:FAINT].sum())
-            freedom += float((of.count - 1)[:FAINT].sum())
-        return cls(relative, max(excess / max(freedom, 1.0), 0.0), dof)
+            freedom += float(of.freedom[:FAINT].sum())
+        floor = max(excess / max(freedom, 1.0), 0.0)
+        return cls(relative, floor, dof)
 
     def variance(self, of: _Codes) -> FloatArray:
         """The variance of each code's mean (k,)."""
-        return np.asarray(((self.relative * of.mean) ** 2 + self.floor) / of.count)
+        of_reading = (self.relative * of.mean) ** 2 + self.floor
+        return np.asarray(of_reading / of.count)
 
 
 def _light(was: CheckReadings, now: CheckReadings) -> list[_Change]:
@@ -281,7 +298,10 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[_Change]:
     before, after = _Codes.of(was), _Codes.of(now)
     noisy = [of for of in (before, after) if of.is_noisy]
     noise = _Noise.of(codes, noisy)
-    sigma = np.sqrt(sum((noise.variance(of) for of in noisy), np.zeros(len(codes))))
+    variance = np.zeros(len(codes))
+    for of in noisy:
+        variance += noise.variance(of)
+    sigma = np.sqrt(variance)
     lit = codes > 0
     log_code = np.log(codes[lit] / codes[-1])
     change = after.mean[lit] / before.mean[lit] - 1
@@ -302,11 +322,14 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[_Change]:
     rest_u = typical * math.sqrt(free / count)
     to_white = 100 / before.mean[-1]
     black = to_white * float(after.mean[0] - before.mean[0])
+    black_u = to_white * float(sigma[0])
+    brighter = 100 * float(middle @ slope)
+    dof = noise.dof
     return [
-        _Change("brightness", 100 * float(middle @ slope), 100 * brightness_u, noise.dof),
-        _Change("gamma", float(slope[1]), gamma_u, noise.dof),
-        _Change("response_rest", rest * typical, rest_u, noise.dof, free),
-        _Change("black", black, to_white * float(sigma[0]), noise.dof),
+        _Change("brightness", brighter, 100 * brightness_u, dof),
+        _Change("gamma", float(slope[1]), gamma_u, dof),
+        _Change("response_rest", rest * typical, rest_u, dof, free),
+        _Change("black", black, black_u, dof),
     ]
 
 
@@ -334,15 +357,17 @@ def _geometry(file: BenchFile, was: CheckReadings, now: CheckReadings) -> list[_
     free = 2.0 * count - 4
     rest_u = rest.noise * math.sqrt(free / (2 * dots))
     rest_arcsec = float(np.sqrt((fitted**2).mean()))
-    x, y, scale, turn = solution.tolist()
-    x_u, y_u, scale_u, turn_u = error.tolist()
+    to_unit = np.array([1.0, 1.0, PPM_PER_ARCSEC, 1.0])
+    x, y, scale, turn = (to_unit * solution).tolist()
+    x_u, y_u, scale_u, turn_u = (to_unit * error).tolist()
+    dof = rest.dof
     return [
         _Change("evenness", even, even_u, light.dof, count - 1),
-        _Change("scale", PPM_PER_ARCSEC * scale, PPM_PER_ARCSEC * scale_u, rest.dof),
-        _Change("rotation", turn, turn_u, rest.dof),
-        _Change("shift_x", x, x_u, rest.dof),
-        _Change("shift_y", y, y_u, rest.dof),
-        _Change("geometry_rest", rest_arcsec, rest_u, rest.dof, free),
+        _Change("scale", scale, scale_u, dof),
+        _Change("rotation", turn, turn_u, dof),
+        _Change("shift_x", x, x_u, dof),
+        _Change("shift_y", y, y_u, dof),
+        _Change("geometry_rest", rest_arcsec, rest_u, dof, free),
     ]
 
 
@@ -351,8 +376,9 @@ def _dots_of_both(was: CheckReadings, now: CheckReadings) -> tuple[DotReadings, 
     places = []
     for readings in (was, now):
         keys = zip(readings.x_px, readings.y_px, strict=True)
-        places.append({key: number for number, key in enumerate(keys)})
-    both = sorted(places[0].keys() & places[1].keys())
+        places.append(dict(zip(keys, itertools.count(), strict=False)))
+    first, second = places
+    both = sorted(first.keys() & second.keys())
     if len(both) < 4 * len(TOLERANCES):
         raise InputError(
             f"{len(both)} dots are seen now and were then; look at focus, exposure and what covers"
@@ -361,8 +387,8 @@ def _dots_of_both(was: CheckReadings, now: CheckReadings) -> tuple[DotReadings, 
     dots = []
     for readings, place in zip((was, now), places, strict=True):
         rows = [place[key] for key in both]
-        seen = readings.seen_x_px, readings.seen_y_px
-        columns = np.array([readings.x_px, readings.y_px, *seen, readings.dot_light])
+        dots_seen = readings.seen_x_px, readings.seen_y_px
+        columns = np.array([readings.x_px, readings.y_px, *dots_seen, readings.dot_light])
         dots.append(DotReadings(*columns[:, rows]))
     return dots[0], dots[1]
 
@@ -401,14 +427,14 @@ def record(
     columns = ["made", "certificate", *(field.name for field in fields(CheckFigure))]
     rows: list[dict[str, str]] = []
     if exists(path):
-        rows = list(csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))))
+        rows = _rows_of(path)
         if any(set(row) != set(columns) for row in rows):
             raise InputError(f"{path}: its columns are not {', '.join(columns)}; move it away")
     stamp = made.isoformat(timespec="milliseconds")  # two checks of one second are two
     for figure in figures:
         texts = {name: str(value) for name, value in asdict(figure).items()}
         rows.append({"made": stamp, "certificate": since, **texts})
-    write_csv(path, columns, ([row[name] for name in columns] for row in rows))
+    write_csv(path, columns, map(operator.itemgetter(*columns), rows))
     draw_checks(folder / CHART, rows)
     return rows
 
@@ -438,6 +464,11 @@ def draw_checks(path: Path, rows: list[dict[str, str]]) -> None:
         panels[-1].set_xlabel("days since the first check")
 
 
+def _rows_of(path: Path) -> list[dict[str, str]]:
+    """The rows of a file of checks. Raises InputError where it cannot be read."""
+    return list(csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))))
+
+
 def _column(rows: list[dict[str, str]], name: str) -> FloatArray:
     """A column (n,) of numbers of rows of checks."""
     return np.array([float(row[name]) for row in rows])
@@ -460,10 +491,10 @@ def largest_changes(folder: Path) -> dict[str, float] | None:
         return None
     changes: dict[str, float] = {}
     try:
-        for row in csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))):
-            changes[row["quantity"]] = max(
-                abs(float(row["value"])), changes.get(row["quantity"], 0.0)
-            )
+        for row in _rows_of(path):
+            quantity = row["quantity"]
+            change = abs(float(row["value"]))
+            changes[quantity] = max(change, changes.get(quantity, 0.0))
     except (KeyError, ValueError) as error:
         raise InputError(
             f"{path}: is no table of checks ({shortened(error)}); move it away"
@@ -481,8 +512,11 @@ def watch(reader: Reader, white: int, longest_min: float, path: Path) -> WarmUp:
 
     t_s, light = watch_white(read, reader.now_ns, reader.wait, longest_min * 60)
     judged = judge_warm_up(t_s, light)
+    minutes = t_s / 60
+    last = light[-1]
+    fitted = fitted_white(judged, t_s, light)
     with chart(path, judged.line) as (axes,):
-        axes.plot(t_s / 60, light / light[-1], "o", color=BLUE, ms=3)
-        axes.plot(t_s / 60, fitted_white(judged, t_s, light) / light[-1], color=ORANGE)
+        axes.plot(minutes, light / last, "o", color=BLUE, ms=3)
+        axes.plot(minutes, fitted / last, color=ORANGE)
         axes.set(xlabel="time [min]", ylabel="white over its last reading")
     return judged

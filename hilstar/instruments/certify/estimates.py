@@ -96,8 +96,10 @@ class LightDeviation:
         """What each code's value adds to the deviation at lights (n,): (n, k). Beyond the codes
         read it is held.
         """
-        spline = CubicSpline(self.log_light, np.eye(len(self.log_light)), bc_type="natural")
-        return np.asarray(spline(np.clip(log_light, self.log_light[0], self.log_light[-1])))
+        unit = np.eye(len(self.log_light))
+        spline = CubicSpline(self.log_light, unit, bc_type="natural")
+        faintest, brightest = self.log_light[0], self.log_light[-1]
+        return np.asarray(spline(np.clip(log_light, faintest, brightest)))
 
     def bent(self, log_light: FloatArray) -> FloatArray:
         """By how much the spline is above straight lines from code to code, at lights (n,)."""
@@ -114,14 +116,17 @@ class LightDeviation:
         """
         none = np.zeros(len(log_light))
         step = np.diff(self.log_light)
-        inner = np.flatnonzero((step[1:] < MAX_ROUGH_STEP) & (step[:-1] < MAX_ROUGH_STEP)) + 1
+        is_near = step < MAX_ROUGH_STEP
+        inner = np.flatnonzero(is_near[1:] & is_near[:-1]) + 1
         if len(inner) < MIN_ROUGH_CODES:
             return none
         gaps = self._gaps()[inner]
         factors = [self.factors, self.dark_factors, self.lasting_factors]
-        noise = ((gaps @ np.concatenate(factors, axis=1)) ** 2).sum(axis=1)
+        by_cause = gaps @ np.concatenate(factors, axis=1)
+        noise = (by_cause**2).sum(axis=1)
         off = (gaps @ self.value) ** 2
-        if fdtrc(len(inner), self.dof, float((off / noise).mean())) > ROUGH_P:
+        ratio = float((off / noise).mean())
+        if fdtrc(len(inner), self.dof, ratio) > ROUGH_P:
             return none
         excess = (off - noise) / (gaps**2).sum(axis=1)
         window = np.ones(ROUGH_CODES)
@@ -129,8 +134,9 @@ class LightDeviation:
         around = np.convolve(excess, window, mode="same") / count
         local = np.interp(log_light, self.log_light[inner], np.maximum(around, 0.0))
         between = 1 + (self.weights(log_light) ** 2).sum(axis=1)
-        read = (np.abs(log_light[:, None] - self.log_light) < SAME_LIGHT).any(axis=1)
-        return np.asarray(np.where(read, 0.0, np.sqrt(local * between)))
+        apart = np.abs(log_light[:, None] - self.log_light)
+        is_read = (apart < SAME_LIGHT).any(axis=1)
+        return np.asarray(np.where(is_read, 0.0, np.sqrt(local * between)))
 
     def _gaps(self) -> FloatArray:
         """Each code's value less what the others foretell, as shares of all values (k, k); the
@@ -153,42 +159,48 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     that it sees, and has a floor where a black screen scatters by more than that.
     """
     fit = _LightFit(read)
-    by_light, by_dark = fit.by_light(), fit.by_dark()
-    structure = in_time(fit.when, fit.residual / fit.sigma, fit.design / fit.sigma[:, None])
+    by_light = _above_black(fit.by_light(), fit.size)
+    by_dark = _above_black(fit.by_dark(), fit.size)
+    standardised = fit.residual / fit.sigma
+    structure = in_time(fit.when, standardised, fit.design / fit.sigma[:, None])
     if structure.total:
         # What is correlated is no noise of a reading by itself.
         alone = math.sqrt(structure.noise_variance)
-        by_light, by_dark = alone * by_light, alone * by_dark
-    lasting = fit.inverse @ lasting_root(fit.when, structure)
-    light = fit.solution[1 : fit.size] - fit.solution[0]
-    white_errors = [_above_black(rows, fit.size)[-1] for rows in (by_light, by_dark)]
-    if not light[-1] > FAINT_SIGMAS * float(np.linalg.norm(np.concatenate(white_errors))):
+        by_light *= alone
+        by_dark *= alone
+    by_lasting = _above_black(fit.inverse @ lasting_root(fit.when, structure), fit.size)
+    light = _above_black(fit.solution, fit.size)
+    white_error = float(np.hypot(np.linalg.norm(by_light[-1]), np.linalg.norm(by_dark[-1])))
+    if not light[-1] > FAINT_SIGMAS * white_error:
         raise InputError(
             "white reads no light above black; look at what the screen shows, and expose longer"
         )
     response = grey_response(file).light[fit.codes[1:]]
     square_px = _square(file, read)
     expected = white_of(file) * _evenness_in(file, square_px) * response
-    value = light / expected
+    relative = 1 / expected[:, None]
+    common = fit.means(read.common)[1:]
     return LightDeviation(
         log_light=np.log(response),
-        value=value,
-        factors=_above_black(by_light, fit.size) / expected[:, None],
+        value=light / expected,
+        factors=relative * by_light,
         dof=fit.light_dof,
         noise=fit.noise,
-        dark_factors=_above_black(by_dark, fit.size) / expected[:, None],
+        dark_factors=relative * by_dark,
         dark_dof=fit.dark_dof,
         dark=float(fit.floor / light[-1]),
-        lasting_factors=_above_black(lasting, fit.size) / expected[:, None],
+        lasting_factors=relative * by_lasting,
         lasting=structure,
         square_px=square_px,
-        common_factors=fit.means(read.common)[1:] * value[:, None],
+        common_factors=relative * common,
         beside=read.beside,
     )
 
 
 def _above_black(rows: FloatArray, codes: int) -> FloatArray:
-    """Factors (codes - 1, k) of lit codes above black, of those of all numbers of the fit."""
+    """What is of the lit codes (codes - 1, ...) above black, in what is of all numbers of the
+    fit.
+    """
     return np.asarray(rows[1:codes] - rows[0])
 
 
@@ -204,8 +216,9 @@ def _evenness_in(file: BenchFile, square_px: tuple[int, int, int]) -> float:
     even = bench_calibration(file.config, file.folder).uniformity_map(size)
     if even is None:
         return 1.0
-    left, top, side = square_px
-    return float(even[top : top + side, left : left + side].mean())
+    first_x, first_y, side = square_px
+    square = even[first_y : first_y + side, first_x : first_x + side]
+    return float(square.mean())
 
 
 class _LightFit:
@@ -257,7 +270,8 @@ class _LightFit:
         """
         self.noise, self.floor = 1.0, 0.0
         for _ in range(3):
-            self.sigma = np.hypot(self.noise * self._shape, max(self.floor, least * self.noise))
+            floor = max(self.floor, least * self.noise)
+            self.sigma = np.hypot(self.noise * self._shape, floor)
             weighted = self.design / self.sigma[:, None]
             self.inverse = np.linalg.pinv(weighted)
             self.solution = self.inverse @ (light / self.sigma)
@@ -322,11 +336,14 @@ class Surface:
         x = (np.arange(fields_along) + 0.5) * wide / fields_along - 0.5
         y = (np.arange(fields_down) + 0.5) * high / fields_down - 0.5
         grid_x, grid_y = np.meshgrid(x, y)
-        grid = (self.terms(grid_x.ravel(), grid_y.ravel()) @ self.value[:, 0]).reshape(grid_x.shape)
+        coefficients = self.value[:, 0]
+        at_fields = self.terms(grid_x.ravel(), grid_y.ravel()) @ coefficients
+        grid = at_fields.reshape(grid_x.shape)
         rows = weights_of_grid(high, fields_down)[np.rint(y_px).astype(np.intp)]
         columns = weights_of_grid(wide, fields_along)[np.rint(x_px).astype(np.intp)]
         linear = np.einsum("nr,rc,nc->n", rows, grid, columns)
-        return np.asarray(self.terms(x_px, y_px) @ self.value[:, 0] - linear)
+        smooth = self.terms(x_px, y_px) @ coefficients
+        return np.asarray(smooth - linear)
 
 
 def surface(
@@ -339,7 +356,7 @@ def surface(
     """Fit a surface to values (n, columns) at pixels; wild ones do not count. Raises InputError
     for too few dots.
     """
-    usable = np.isfinite(values).all(axis=1)
+    usable: BoolArray = np.asarray(np.isfinite(values).all(axis=1))
     best: Surface | None = None
     best_squares = 0.0
     for degree in degrees:
@@ -356,7 +373,8 @@ def surface(
         best = Surface(degree, resolution_px, solution, noise * root, float(dof), noise)
         best_squares = squares
     if best is None:
-        needed = DOTS_A_TERM * (degrees[0] + 1) * (degrees[0] + 2) // 2
+        first = degrees[0]
+        needed = DOTS_A_TERM * (first + 1) * (first + 2) // 2
         raise InputError(
             f"{int(usable.sum())} dots are seen and {needed} are needed; look at focus, exposure"
             " and [collimator]"
@@ -402,8 +420,9 @@ def place_errors(file: BenchFile, read: DotReadings) -> FloatArray:
     geometry = geometry_of(file)
     seen = geometry.tracker.rays(read.seen_x_px, read.seen_y_px)
     shown = geometry.monitor.rays(read.x_px, read.y_px)
-    off = seen[:, :2] / seen[:, 2:] - shown[:, :2] / shown[:, 2:]
-    return np.asarray(off * ARCSEC_PER_RAD)
+    seen_tangents = seen[:, :2] / seen[:, 2:]
+    shown_tangents = shown[:, :2] / shown[:, 2:]
+    return np.asarray((seen_tangents - shown_tangents) * ARCSEC_PER_RAD)
 
 
 def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
@@ -415,11 +434,13 @@ def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
     expected = np.ones(len(read.x_px))
     if known is not None:
         row = np.rint(read.y_px).astype(np.intp)
-        expected = known[row, np.rint(read.x_px).astype(np.intp)].astype(np.float64)
+        column = np.rint(read.x_px).astype(np.intp)
+        expected = known[row, column].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.log(read.light / expected)
     fit = surface(read.x_px, read.y_px, off[:, None], EVEN_DEGREES, size)
-    residual = off - fit.terms(read.x_px, read.y_px) @ fit.value[:, 0]
+    fitted = fit.terms(read.x_px, read.y_px) @ fit.value[:, 0]
+    residual = off - fitted
     usable = np.isfinite(residual)
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[usable])))
     usable &= np.abs(residual) <= WILD_SIGMAS * max(spread, SMALL_SPREAD)
@@ -439,7 +460,7 @@ class Evenness:
     fit: Surface
     cells: Cells
     solve: FloatArray
-    found: Structure
+    structure: Structure
 
     def scatter(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
         """What the structure adds to sums of log light: factors (k, sums) at pixels (n,), whose
@@ -449,12 +470,15 @@ class Evenness:
         by_cell = self.cells.means(self.solve.T) * self.cells.count[:, None]
         weights = shares @ terms @ by_cell.T
         covariance = np.zeros((len(shares), len(shares)))
-        apart = (x_px[:, None] - x_px) ** 2 + (y_px[:, None] - y_px) ** 2
-        for length, variance in self.found.parts():
+        right_px = x_px[:, None] - x_px
+        down_px = y_px[:, None] - y_px
+        apart = right_px**2 + down_px**2
+        for length, variance in self.structure.parts():
             eigen, rows, columns = self.cells.basis(length)
             turned = self.cells.turned(rows, columns, weights.T)
             crossed = shares @ self.cells.towards(x_px, y_px, length) @ weights.T
-            at_stars = shares @ np.exp(-apart / (2 * length**2)) @ shares.T
+            correlation = np.exp(-apart / (2 * length**2))
+            at_stars = shares @ correlation @ shares.T
             of_fit = (turned.T * eigen) @ turned
             covariance += variance * (at_stars - crossed - crossed.T + of_fit)
         return smooth_root(covariance)

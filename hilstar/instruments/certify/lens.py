@@ -26,6 +26,7 @@ from hilstar.server.bench.bench_file import BenchFile
 
 EXPECTED_NOISE_PX = 0.03  # of a dot, for the robust steps before its noise is known
 WILD_SIGMAS = 6.0
+MAX_LENS_DOTS = 1000
 SMALL_ARCSEC = 1e-12  # residuals without any noise are not wild
 DERIVATIVE_STEP = 1e-4  # of a parameter's number
 HALF_TANGENT = 0.1  # scale of directions, so that decentring has numbers of order 1
@@ -43,15 +44,15 @@ STILL = np.array([[1.0, 0.0, 0.0, 0.0]])  # the mount of the only image
 class Places:
     """Deviations of place at some pixels (n,), arcsec along the image's x and y.
 
-    `value` (n, 2); `noise` (m, n, 2) and `structure` (k, n, 2) are standardised contributions of
+    `value` (n, 2); `noise` (m, n, 2) and `correlated` (k, n, 2) are standardised contributions of
     the dots' noise and of what is correlated, each with its freedom.
     """
 
     value: FloatArray
     noise: FloatArray
     noise_dof: float
-    structure: FloatArray
-    found: Structure
+    correlated: FloatArray
+    structure: Structure
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,22 +67,23 @@ class LensFit:
     coefficients: FloatArray
     basis: FloatArray
     cells: Cells
-    found: Structure
+    structure: Structure
     dof: float
 
     def at(self, x_px: FloatArray, y_px: FloatArray) -> Places:
         """The deviations at pixels (n,) of the monitor."""
         file_rays = self.geometry.monitor.rays(x_px, y_px)
         wanted = file_rays[:, :2] / file_rays[:, 2:]
-        value = (_tangents(self.fit.geometry.monitor, self.flat, wanted) - wanted) * ARCSEC_PER_RAD
+        shown = _tangents(self.fit.geometry.monitor, self.flat, wanted)
+        value = (shown - wanted) * ARCSEC_PER_RAD
         terms = _terms(self.fit, self.flat, wanted, (x_px, y_px), self.degree)
         # the pattern of the tracker's pixels moves no star
         terms = terms @ self.mix[: terms.shape[2]]
         value += (terms @ self.coefficients).T
         # The basis is orthonormal over the dots, so that each coefficient has the noise of one dot.
-        noise = math.sqrt(self.found.noise_variance) * terms.transpose(2, 1, 0)
-        structure = np.einsum("anp,pm->mna", terms, self._of_structure())
-        return Places(value, noise, self.dof, structure, self.found)
+        noise = math.sqrt(self.structure.noise_variance) * terms.transpose(2, 1, 0)
+        correlated = np.einsum("anp,pm->mna", terms, self._of_structure())
+        return Places(value, noise, self.dof, correlated, self.structure)
 
     def _of_structure(self) -> FloatArray:
         """What the dots' structure does to the coefficients: factors (terms, k) of its
@@ -89,7 +91,7 @@ class LensFit:
         """
         covariance = np.zeros((len(self.coefficients), len(self.coefficients)))
         by_cell = [self.cells.means(axis) * self.cells.count[:, None] for axis in self.basis]
-        for length, variance in self.found.parts():
+        for length, variance in self.structure.parts():
             eigen, rows, columns = self.cells.basis(length)
             for axis in by_cell:
                 turned = self.cells.turned(rows, columns, axis)
@@ -111,7 +113,7 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     )
     rays = monitor.rays(read.x_px, read.y_px)
     wanted = rays[:, :2] / rays[:, 2:]
-    lens = _fitted(geometry, flat, wanted, read, usable)
+    lens = _fitted(geometry, flat, wanted, read, _thinned(usable))
     shown = _tangents(lens.geometry.monitor, flat, wanted)
     residual = seen_off - (shown - wanted) * ARCSEC_PER_RAD
     usable = _tame(read, residual, usable, monitor.resolution_px)
@@ -135,11 +137,22 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
         dof = float(2 * len(x) - is_told.sum())
         # By what the residuals show: the variance of a structure as long as the field is hardly
         # known.
-        if float((rest**2).sum()) / dof <= (1 + DOT_VARIANCE) * structure.noise_variance:
+        largest = (1 + DOT_VARIANCE) * structure.noise_variance
+        if float((rest**2).sum()) / dof <= largest:
             break
     mix = across[is_told].T / size[is_told] / scale[:, None]
     cells = Cells(x, y)
     return LensFit(geometry, flat, lens, degree, mix, coefficients, basis, cells, structure, dof)
+
+
+def _thinned(usable: BoolArray) -> BoolArray:
+    """Of the usable dots (n,) about MAX_LENS_DOTS, all over the field: the lens is fitted by steps,
+    and what it leaves by all dots at once.
+    """
+    every = max(int(usable.sum()) // MAX_LENS_DOTS, 1)
+    thinned = np.zeros_like(usable)
+    thinned[np.flatnonzero(usable)[::every]] = True
+    return thinned
 
 
 def _tame(

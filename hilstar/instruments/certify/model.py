@@ -73,7 +73,8 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
     """
     rng = np.random.default_rng(SEED)
     stars: list[ReferenceStar] = []
-    attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
+    attitudes = rng.normal(size=(ATTITUDES, 4))
+    attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
     geometry = geometry_of(file)
     number = 0
     with open_bench(file) as bench:
@@ -107,7 +108,8 @@ def _of_field(
         members = usable[third[usable] == third_number]  # the brightest first
         if not len(members):
             continue
-        picked = np.unique(np.linspace(0, len(members) - 1, STARS_A_THIRD).astype(np.intp))
+        steps = np.linspace(0, len(members) - 1, STARS_A_THIRD)
+        picked = np.unique(steps.astype(np.intp))
         for k in members[picked]:
             pixel_px = _window(bench, x[k], y[k])
             at = pixel_px[:, 0], pixel_px[:, 1]
@@ -116,6 +118,8 @@ def _of_field(
             lit = light > 0
             if not lit.any() or wanted <= 0:
                 continue
+            total = float(light.sum())
+            levels = frame.levels[at][lit]
             star = ReferenceStar(
                 hip=int(rows["hip"][k]),
                 row=int(bench.stars.row[frame.star[k]]),
@@ -126,9 +130,9 @@ def _of_field(
                 x_px=float(x[k]),
                 y_px=float(y[k]),
                 direction=vectors[k],
-                quantised_mag=float(magnitude(float(light.sum()) / wanted)),
-                log_light=np.log(bench.calibration.response.light[frame.levels[at][lit]]),
-                share=light[lit] / light[lit].sum(),
+                quantised_mag=float(magnitude(total / wanted)),
+                log_light=np.log(bench.calibration.response.light[levels]),
+                share=light[lit] / total,
                 pixel_px=pixel_px[lit],
             )
             stars.append(star)
@@ -162,8 +166,9 @@ def _reach(bench: Bench) -> int:
 def _window(bench: Bench, x_px: float, y_px: float) -> IntArray:
     """The rows and columns (n, 2) of the pixels about a place."""
     reach = _reach(bench)
-    row, column = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
-    return np.stack([row + round(y_px), column + round(x_px)], axis=1).astype(np.intp)
+    about = np.arange(-reach, reach + 1, dtype=np.intp)
+    row, column = np.meshgrid(round(y_px) + about, round(x_px) + about, indexing="ij")
+    return np.stack([row.ravel(), column.ravel()], axis=1)
 
 
 def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
@@ -215,14 +220,17 @@ class Figures:
         lights = np.concatenate([star.log_light for star in stars])
         self.log_light, place = np.unique(lights, return_inverse=True)
         self._shares = np.zeros((len(stars), len(self.log_light)))
-        star_of = np.repeat(np.arange(len(stars)), [len(star.share) for star in stars])
-        np.add.at(self._shares, (star_of, place), np.concatenate([star.share for star in stars]))
+        pixels = [len(star.share) for star in stars]
+        star_of = np.repeat(np.arange(len(stars)), pixels)
+        shares = np.concatenate([star.share for star in stars])
+        np.add.at(self._shares, (star_of, place), shares)
         self.x_px = np.array([star.x_px for star in stars])
         self.y_px = np.array([star.y_px for star in stars])
         self._direction = np.stack([star.direction for star in stars])
         self.tangent = self._direction[:, :2] / self._direction[:, 2:]
         field = np.array([star.field for star in stars])
-        self._of_field = [np.flatnonzero(field == number) for number in range(field.max() + 1)]
+        fields = int(field.max()) + 1
+        self._of_field = [np.flatnonzero(field == number) for number in range(fields)]
         self.names: list[tuple[str, int, str]] = []
         for quantity, unit in STAR_QUANTITIES:
             self.names += [(quantity, star, unit) for star in range(len(stars))]
@@ -264,15 +272,17 @@ class Figures:
         rays = np.ones((len(place_arcsec), len(stars), 3))
         rays[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
         rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-        u, _, right = np.linalg.svd(np.einsum("bsi,sj->bij", rays, self._direction[stars]))
+        profile = np.einsum("bsi,sj->bij", rays, self._direction[stars])
+        u, _, right = np.linalg.svd(profile)
         u[..., 2] *= np.linalg.det(u @ right)[:, None]
         turn = u @ right
         skew = turn - turn.transpose(0, 2, 1)
         # The axial vector of a rotation by an angle a is 2 sin(a) times its axis.
-        axial = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-        sine = np.linalg.norm(axial, axis=1, keepdims=True) / 2
-        angle = np.arcsin(np.clip(sine, SMALLEST, 1.0))
-        return np.asarray(axial / 2 * ARCSEC_PER_RAD * angle / np.maximum(sine, SMALLEST))
+        axial = skew[:, (2, 0, 1), (1, 2, 0)] / 2
+        sine = np.linalg.norm(axial, axis=1, keepdims=True)
+        sine = np.clip(sine, SMALLEST, 1.0)
+        angle = np.arcsin(sine)
+        return np.asarray(axial * ARCSEC_PER_RAD * angle / sine)
 
 
 def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
@@ -284,10 +294,11 @@ def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
     levels *= white_of(truth) / white_of(file)
     here_px = figures.x_px, figures.y_px
     true_px = in_true_image(file, truth, *here_px)
-    even = np.log(_evenness_at(truth, *true_px)) - np.log(_evenness_at(file, *here_px))
-    place = _tangents_at(truth, *true_px) - _tangents_at(file, *here_px)
-    delay = np.array([truth.config.monitor.panel_delay_ms])
-    return Deviations(levels[None], even[None], place[None] * ARCSEC_PER_RAD, delay, np.zeros(1))
+    even = np.log(_evenness_at(truth, *true_px) / _evenness_at(file, *here_px))
+    tangents = _tangents_at(truth, *true_px) - _tangents_at(file, *here_px)
+    place_arcsec = tangents * ARCSEC_PER_RAD
+    delay_ms = np.array([truth.config.monitor.panel_delay_ms])
+    return Deviations(levels[None], even[None], place_arcsec[None], delay_ms, np.zeros(1))
 
 
 def _evenness_at(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:

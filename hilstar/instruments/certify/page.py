@@ -216,7 +216,8 @@ def _heads(found: Certificate, digest: str) -> Iterator[tuple[object, object]]:
     yield "decision rule", RULES[found.decision]
     if found.replaces:
         yield "replaces", found.replaces
-    yield "certificate.json", Markup(f"SHA-256 <code>{digest}</code>; signing it is the user's")
+    code = f"<code>{digest}</code>"
+    yield "certificate.json", Markup(f"SHA-256 {code}; signing it is the user's")
     yield "hilstar", found.hilstar
 
 

@@ -84,11 +84,11 @@ def _form(figures: Figures, read: Read) -> FloatArray:
 
 def _places_in(square_px: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Places (n,) all over a square of the screen, left, top and side, px."""
-    left, top, side = square_px
+    first_x, first_y, side = square_px
     along = np.zeros(1)
     if side > 1:
         along = (np.arange(PLACES_IN_SQUARE) + 0.5) / PLACES_IN_SQUARE * side - 0.5
-    x, y = np.meshgrid(left + along, top + along)
+    x, y = np.meshgrid(first_x + along, first_y + along)
     return x.ravel(), y.ravel()
 
 
@@ -118,9 +118,9 @@ def _of_evenness(even: Evenness, terms: FloatArray, form: FloatArray) -> Iterato
     """
     noise = even.fit.noise
     factors = even.fit.factors
-    if even.found.total:
+    if even.structure.total:
         # What is the screen's is no noise of the dots.
-        alone = math.sqrt(even.found.noise_variance)
+        alone = math.sqrt(even.structure.noise_variance)
         factors = factors * alone / noise
         noise = alone
     size = terms.shape[1]
@@ -136,7 +136,7 @@ def _of_evenness(even: Evenness, terms: FloatArray, form: FloatArray) -> Iterato
 
 def _of_places(place: Places) -> Effect:
     """The effect of the noise of dots' places."""
-    error = math.sqrt(place.found.noise_variance)
+    error = math.sqrt(place.structure.noise_variance)
     size = len(place.noise)
     source = "places of dots"
     geometry = Input("geometry", "Student t", source, size, error, "arcsec", place.noise_dof)
@@ -175,16 +175,16 @@ def _of_structure(figures: Figures, read: Read, place: Places) -> Iterator[Effec
         yield Effect(codes, levels=np.diag(rough))
     if read.light.beside is not None:
         yield from _of_neighbours(read.light.beside, len(figures.stars))
-    if read.even.found.total:
+    if read.even.structure.total:
         yield _of_uneven_light(figures, read)
-    if place.found.total:
-        error = math.sqrt(place.found.total)
-        length = place.found.mean_length
+    if place.structure.total:
+        error = math.sqrt(place.structure.total)
+        length = place.structure.mean_length
         source = f"places of dots about the lens, which correlate over {length:.0f} px"
-        size = len(place.structure)
-        dof = place.found.dof
+        size = len(place.correlated)
+        dof = place.structure.dof
         dots = Input("dots that correlate", "Student t", source, size, error, "arcsec", dof)
-        yield Effect(dots, place=place.structure)
+        yield Effect(dots, place=place.correlated)
 
 
 def _of_common_light(light: LightDeviation, figures: Figures) -> Iterator[Effect]:
@@ -233,7 +233,7 @@ def _of_uneven_light(figures: Figures, read: Read) -> Effect:
     """The effect of the light that a map leaves, at each star's place and in the square where light
     was read.
     """
-    structure = read.even.found
+    structure = read.even.structure
     count = len(figures.stars)
     x, y = _places_in(read.light.square_px)
     of_square = np.full((count, len(x)), -1 / len(x))

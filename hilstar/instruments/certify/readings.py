@@ -48,8 +48,8 @@ PAIRS = 4  # of images, for each ratio of two lattices
 BESIDE_PAIRS = 16  # of simulated readings: a third of a reading's noise, as what white has in all
 DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could saturate the tracker
 WATCHED_S = 5.0
+DOT_REACH_SIGMAS = 5.0  # of a dot: its light is in a square of so many to each side
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
-NO_LIGHT_DN_PER_S = 1e-9
 STEP_PX = 10.0  # of the screen, by which the mounting of a truth is compared
 
 
@@ -65,7 +65,8 @@ class BesideRatio:
     @property
     def excess(self) -> float:
         """How far the ratio is from 1 beyond its noise, one sigma."""
-        return math.sqrt(max((self.ratio - 1) ** 2 - self.error**2, 0.0))
+        square = (self.ratio - 1) ** 2 - self.error**2
+        return math.sqrt(max(square, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +75,9 @@ class LightReadings:
     (n,), at t_s (n,).
 
     It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings
-    have in common, as the ratios of lattices, is in `common` (n, inputs), one sigma relative to
-    light. `noise` (n,) is each reading's noise, e-/s, up to a factor that their scatter tells; None
-    where it goes with light. `beside` is None where no neighbouring pixels were read.
+    have in common, as the ratios of lattices, is in `common` (n, inputs), one sigma, e-/s. `noise`
+    (n,) is each reading's noise, e-/s, up to a factor that their scatter tells; None where it goes
+    with light. `beside` is None where no neighbouring pixels were read.
     """
 
     code: IntArray
@@ -116,30 +117,27 @@ def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
     """
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     width, height = geometry.monitor.resolution_px
-    seen_share = math.prod(
-        min(ratio * s, t)
-        for s, t in zip((width, height), geometry.tracker.resolution_px, strict=True)
-    )
-    step = max(
-        math.ceil(max(APART_TRACKER_PX, math.sqrt(seen_share / MAX_DOTS)) / ratio), 2 * DOT_PX
-    )
-    x, y = (
-        part.ravel()
-        for part in np.meshgrid(
-            np.arange(step // 2, width - DOT_PX, step), np.arange(step // 2, height - DOT_PX, step)
-        )
-    )
-    at_x, at_y = geometry.to_tracker(x.astype(np.float64), y.astype(np.float64))
     wide, high = geometry.tracker.resolution_px
+    seen_px2 = min(ratio * width, wide) * min(ratio * height, high)
+    apart_px = max(APART_TRACKER_PX, math.sqrt(seen_px2 / MAX_DOTS))
+    step = max(math.ceil(apart_px / ratio), 2 * DOT_PX)
+    along = np.arange(step // 2, width - DOT_PX, step)
+    down = np.arange(step // 2, height - DOT_PX, step)
+    grid_x, grid_y = np.meshgrid(along, down)
+    x = grid_x.ravel()
+    y = grid_y.ravel()
+    at_x, at_y = geometry.to_tracker(x.astype(np.float64), y.astype(np.float64))
+    last_x = wide - 1 - EDGE_TRACKER_PX
+    last_y = high - 1 - EDGE_TRACKER_PX
     with np.errstate(invalid="ignore"):
-        kept = (at_x > EDGE_TRACKER_PX) & (at_x < wide - 1 - EDGE_TRACKER_PX)
-        kept &= (at_y > EDGE_TRACKER_PX) & (at_y < high - 1 - EDGE_TRACKER_PX)
-    if kept.sum() < MIN_DOTS:
+        visible = (at_x > EDGE_TRACKER_PX) & (at_x < last_x)
+        visible &= (at_y > EDGE_TRACKER_PX) & (at_y < last_y)
+    if visible.sum() < MIN_DOTS:
         raise InputError(
-            f"the tracker sees {int(kept.sum())} dots of the screen and {MIN_DOTS} are needed; look"
-            " at [collimator]"
+            f"the tracker sees {int(visible.sum())} dots of the screen and {MIN_DOTS} are needed;"
+            " look at [collimator]"
         )
-    return x[kept], y[kept]
+    return x[visible], y[visible]
 
 
 def delays_of(recording: image_sources.DiodeRecording | None, file: BenchFile) -> FloatArray:
@@ -203,9 +201,11 @@ class VirtualReader:
         else:
             here = float(self._uniformity[height // 2, width // 2])
         warmth = 1 + noise.drift_percent_per_h / 100 * t_s / 3600
-        cold = noise.cold_percent / 100 * np.exp(-t_s / (60 * noise.warm_up_min))
-        scale = self._white_e_per_s * here * (1 + noise.instrument_error) * (warmth - cold)
-        wanted = (self._response.light[codes] + self._response.black) * scale
+        cooling = np.exp(-t_s / (60 * noise.warm_up_min))
+        cold = noise.cold_percent / 100 * cooling
+        white = self._white_e_per_s * here * (1 + noise.instrument_error)
+        share = self._response.light[codes] + self._response.black
+        wanted = share * white * (warmth - cold)
         read: FloatArray = wanted * (1 + noise.reading_noise * rng.standard_normal(len(codes)))
         return LightReadings(codes, read, t_s, beside=self._beside())
 
@@ -226,27 +226,18 @@ class VirtualReader:
             row = true_y.astype(np.intp)
             column = true_x.astype(np.intp)
             light = self._uniformity[row, column].astype(np.float64)
-        light *= 1 + less * self._noise.reading_noise * self._rng.standard_normal(len(x))
-        seen_x, seen_y = (
-            part + less * self._noise.dot_noise_px * self._rng.standard_normal(len(x))
-            for part in seen_px
-        )
+        light_noise = less * self._noise.reading_noise
+        light *= 1 + light_noise * self._rng.standard_normal(len(x))
+        noise_px = less * self._noise.dot_noise_px
+        seen_x, seen_y = (part + noise_px * self._rng.standard_normal(len(x)) for part in seen_px)
         is_visible = np.isfinite(seen_x) & np.isfinite(seen_y)
         psf_u = less * self._noise.reading_noise
-        psf = float(
-            np.hypot(*tracker_psf(self.truth.config.tracker, self.truth.folder).width_px)
-            / math.sqrt(2)
-        )
+        widths = tracker_psf(self.truth.config.tracker, self.truth.folder).width_px
+        psf = float(np.hypot(*widths)) / math.sqrt(2)
         noisy = psf * (1 + psf_u * float(self._rng.standard_normal()))
-        return DotReadings(
-            x[is_visible],
-            y[is_visible],
-            seen_x[is_visible],
-            seen_y[is_visible],
-            light[is_visible],
-            noisy,
-            psf * psf_u,
-        )
+        columns = np.stack([x, y, seen_x, seen_y, light])[:, is_visible]
+        x, y, seen_x, seen_y, light = columns
+        return DotReadings(x, y, seen_x, seen_y, light, noisy, psf * psf_u)
 
     def delays_ms(self) -> FloatArray:
         """A simulated photodiode."""
@@ -279,8 +270,10 @@ def _is_mounted_alike(file: BenchFile, truth: BenchFile) -> bool:
     x_px = np.array([0.0, STEP_PX, 0.0]) + (width - 1) / 2
     y_px = np.array([0.0, 0.0, STEP_PX]) + (height - 1) / 2
     stated = np.stack(geometry_of(file).to_tracker(x_px, y_px))
-    true = np.stack(geometry_of(truth).to_tracker(*in_true_image(file, truth, x_px, y_px)))
-    steps, true_steps = (poses[:, 1:] - poses[:, :1] for poses in (stated, true))
+    true_px = in_true_image(file, truth, x_px, y_px)
+    true = np.stack(geometry_of(truth).to_tracker(*true_px))
+    steps = stated[:, 1:] - stated[:, :1]
+    true_steps = true[:, 1:] - true[:, :1]
     lengths = np.linalg.norm(steps, axis=0) * np.linalg.norm(true_steps, axis=0)
     cosines = (steps * true_steps).sum(axis=0) / lengths
     return bool((cosines > math.cos(math.pi / 4)).all())
@@ -335,77 +328,100 @@ class ImageReader:
         gain = self.file.config.tracker.detector.gain_e_per_dn
         start_ns = self.now_ns()
         readings = meter.read([Patch(int(code), "w") for code in codes])
+        seconds = (self.now_ns() - start_ns) / NS_PER_S
         # Patches take the same time each.
-        t_s = np.linspace(0.0, (self.now_ns() - start_ns) / NS_PER_S, len(codes))
+        t_s = np.linspace(0.0, seconds, len(codes))
         level = readings.light[codes == 0].mean()
+        field = meter.field
         return LightReadings(
             codes,
             (readings.above_black + level) * gain,
             t_s,
-            square_px=(meter.field.left, meter.field.top, meter.field.side),
-            common=_common(readings),
+            square_px=(field.left, field.top, field.side),
+            common=_common(readings) * gain,
             noise=readings.sigma * gain,
             beside=_beside(readings.links),
         )
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """One image of dots, each found near where the bench file has it."""
-        context = self._context
-        geometry = geometry_of(self.file)
-        code = code_of_light(self.file, DOT_LIGHT)
-        dark = context.read(context.dark())
-        while True:
-            codes = image_sources.black(context.resolution_px)
-            half = DOT_PX // 2
-            for down in range(-half, half + 1):
-                for right in range(-half, half + 1):
-                    codes[y_px + down, x_px + right] = code
-            looked = []
-            for number in range(images):
-                looked.append(
-                    context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark)
-                )
-            if not context.is_too_bright(looked[0]):
-                break
-            code = context.darker(code)
-        image = np.mean([look.image for look in looked], axis=0)
+        image = self._image_of_dots(x_px, y_px, images)
         stars = find_stars(image, dot_settings(self.file), noisiest_background(image))
-        from scipy.spatial import cKDTree
-
-        x = x_px.astype(np.float64)
-        y = y_px.astype(np.float64)
-        expected = np.stack(geometry.to_tracker(x, y), axis=1)
         if len(stars) < MIN_DOTS:
             raise InputError(
                 f"{len(stars)} dots are in the image and {MIN_DOTS} are needed; look at the focus"
                 " and the exposure"
             )
-        far, near = (
-            np.asarray(part)
-            for part in cKDTree(np.stack([stars.x_px, stars.y_px], axis=1)).query(expected)
-        )
-        kept = (far < APART_TRACKER_PX / 2) & ~stars.at_edge[near]
-        if kept.sum() < MIN_DOTS:
+        from scipy.spatial import cKDTree
+
+        geometry = geometry_of(self.file)
+        x = x_px.astype(np.float64)
+        y = y_px.astype(np.float64)
+        expected = np.stack(geometry.to_tracker(x, y), axis=1)
+        places = np.stack([stars.x_px, stars.y_px], axis=1)
+        far, near = (np.asarray(part) for part in cKDTree(places).query(expected))
+        seen = (far < APART_TRACKER_PX / 2) & ~stars.at_edge[near]
+        if seen.sum() < MIN_DOTS:
             raise InputError(
-                f"{int(kept.sum())} dots are where the bench file has them; run the geometry again"
+                f"{int(seen.sum())} dots are where the bench file has them; run the geometry again"
                 " (first-light)"
             )
-        seen_screen = SeenScreen(
-            geometry.monitor,
-            geometry.tracker,
-            is_sure=True,
-            psf_sigma_px=psf_sigma_of(self._context.file),
-        )
-        sharp = seen_sharpness(image, seen_screen, self.file.config.tracker.detector, len(looked))
-        at = near[kept]
-        places = x[kept], y[kept], stars.x_px[at], stars.y_px[at]
-        return DotReadings(*places, stars.flux[at], sharp.psf_sigma_px, sharp.psf_sigma_error_px)
+        sigma_px = psf_sigma_of(self._context.file)
+        screen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True, psf_sigma_px=sigma_px)
+        sharp = seen_sharpness(image, screen, self.file.config.tracker.detector, images)
+        seen_px = stars.x_px[near[seen]], stars.y_px[near[seen]]
+        apart = np.asarray(cKDTree(expected).query(expected, k=2)[0])
+        half_apart = int(apart[:, 1].min()) // 2
+        reach = math.ceil(DOT_REACH_SIGMAS * dot_sigma_px(self.file))
+        light = light_in_squares(image, *seen_px, min(reach, half_apart))
+        psf = sharp.psf_sigma_px, sharp.psf_sigma_error_px
+        return DotReadings(x[seen], y[seen], *seen_px, light, *psf)
+
+    def _image_of_dots(self, x_px: IntArray, y_px: IntArray, images: int) -> FloatArray:
+        """The mean of some images of dots, DN above the dark, in a code that does not saturate the
+        tracker.
+        """
+        context = self._context
+        dark = context.read(context.dark())
+        code = code_of_light(self.file, DOT_LIGHT)
+        while True:
+            codes = image_sources.black(context.resolution_px)
+            half = DOT_PX // 2
+            first_y, first_x = y_px - half, x_px - half
+            for down, right in np.ndindex(DOT_PX, DOT_PX):
+                codes[first_y + down, first_x + right] = code
+            looked = []
+            for number in range(images):
+                pattern = image_sources.Pattern(f"dots_{code:05}_{number}", codes)
+                looked.append(context.look(pattern, dark))
+            if not context.is_too_bright(looked[0]):
+                return np.asarray(np.mean([look.image for look in looked], axis=0))
+            code = context.darker(code)
 
     def delays_ms(self) -> FloatArray:
         """The photodiode's edges, where there is one."""
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
         return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
+
+
+def light_in_squares(
+    image: FloatArray, x_px: FloatArray, y_px: FloatArray, reach: int
+) -> FloatArray:
+    """The sums (n,) of an image (h, w) over squares of 2 `reach` + 1 pixels about places (n,); 0
+    beyond its edge.
+
+    All of a dot's light is in its square. That of the pixels above a threshold is a smaller share
+    of fainter dots, by 0.0006 mag towards the edge of an uneven screen.
+    """
+    padded = np.pad(image, reach)
+    side = 2 * reach + 1
+    sums = np.zeros(len(x_px))
+    row = np.rint(y_px).astype(np.intp)
+    column = np.rint(x_px).astype(np.intp)
+    for down, right in np.ndindex(side, side):
+        sums += padded[row + down, column + right]
+    return sums
 
 
 def _beside(links: list[LatticeRatio]) -> BesideRatio | None:
@@ -420,16 +436,12 @@ def _beside(links: list[LatticeRatio]) -> BesideRatio | None:
 
 
 def _common(readings: Readings) -> FloatArray:
-    """What readings share, relative to their light above black: (n, causes), one standard error
-    of each.
-    """
-    codes = np.array([patch.code for patch in readings.patches])
+    """What readings share, DN/s: (n, causes), one standard error of each."""
+    is_black = np.array([patch.code == 0 for patch in readings.patches])
     # What shifts black as well shifts no light above it.
-    black = readings.common[codes == 0].mean(axis=0)
-    above = np.maximum(readings.above_black, NO_LIGHT_DN_PER_S)
-    relative = (readings.common - black) / above[:, None]
-    relative[codes == 0] = 0.0
-    return np.asarray(relative)
+    above = readings.common - readings.common[is_black].mean(axis=0)
+    above[is_black] = 0.0
+    return np.asarray(above)
 
 
 Reader = VirtualReader | ImageReader

@@ -89,7 +89,9 @@ def _of_response(
     source = f"levels of {name}"
     error = float(np.median(relative))
     response = Input("response", "Student t", source, len(light) + 1, error, "relative", errors.dof)
-    yield Effect(response, levels=np.concatenate([(join * own_relative).T, (join @ black)[None]]))
+    of_levels = (join * own_relative).T
+    of_black = join @ black
+    yield Effect(response, levels=np.concatenate([of_levels, of_black[None]]))
 
 
 def _of_evenness(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
@@ -104,8 +106,10 @@ def _of_evenness(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
         return
     width, height = file.config.monitor.resolution_px
     fields_down, fields_along = light_map.uniformity.shape
-    rows = weights_of_grid(height, fields_down)[np.rint(figures.y_px).astype(np.intp)]
-    columns = weights_of_grid(width, fields_along)[np.rint(figures.x_px).astype(np.intp)]
+    row = np.rint(figures.y_px).astype(np.intp)
+    column = np.rint(figures.x_px).astype(np.intp)
+    rows = weights_of_grid(height, fields_down)[row]
+    columns = weights_of_grid(width, fields_along)[column]
     weights = (rows[:, :, None] * columns[:, None]).reshape(len(figures.stars), -1)
     # each field is known by itself, and stars share them
     slopes = field * np.linalg.qr(weights.T)[1]
@@ -159,7 +163,9 @@ def _of_map(
     name = file.config.collimator.geometry
     wide, high = file.config.monitor.resolution_px
     down, along = map_arcsec.shape
-    at = (figures.y_px + 0.5) / high * (down - 1), (figures.x_px + 0.5) / wide * (along - 1)
+    at_down = (figures.y_px + 0.5) / high * (down - 1)
+    at_along = (figures.x_px + 0.5) / wide * (along - 1)
+    at = at_down, at_along
 
     def seen(values: FloatArray) -> FloatArray:
         return np.asarray(map_coordinates(values, at, order=1, mode="nearest"))

@@ -5,8 +5,8 @@ A fit's residuals are noise, of each reading by itself, and perhaps a part whose
 with distance: as
 exp(-d^2 / 2 L^2) in place, as exp(-t / T) in time. Ratio of the variances and length are those of a
 grid, each by its restricted likelihood (Patterson and Thompson 1971), which takes the fit's own
-terms out. All points of the grid count by their likelihood: a structure whose length is unsure is
-so in what it does. Where none is more likely, there is none.
+terms out. All points of the grid count by their likelihood, and so does it that there is none: a
+structure that is unsure is so in what it does.
 
 In place readings are averaged over cells of a lattice, whose correlations are products of rows and
 columns, so that one grid of ratios costs no more than the squares of a few terms.
@@ -30,6 +30,7 @@ ENOUGH, MIN_CELLS = 0.97, 64
 MIN_FILLED = 0.5  # relative to a full cell: a cell with fewer readings is taken as empty
 TINY = 1e-300
 MIN_DOF = 3.0
+UNLIKELY = 0.01  # less likely structure is none
 # steps between which the likelihood, which is smooth, is interpolated
 FINE_LENGTH, FINE_RATIO = 1.08, 1.12
 
@@ -88,10 +89,13 @@ class Spread:
         normal = self.terms.T @ weighted
         towards = weighted.T @ self.value
         explained = towards @ np.linalg.solve(normal, towards)
-        unexplained = float(self.value @ (weight * self.value) - explained) + self.square
+        total = self.value @ (weight * self.value)
+        unexplained = float(total - explained) + self.square
         dof = len(self.value) - self.terms.shape[1] + self.dof
-        sizes = float(np.linalg.slogdet(normal)[1] - np.log(weight).sum())
-        return -0.5 * (sizes + dof * math.log(max(unexplained, TINY))), unexplained / dof
+        _, log_of_normal = np.linalg.slogdet(normal)
+        sizes = float(log_of_normal - np.log(weight).sum())
+        of_noise = dof * math.log(max(unexplained, TINY))
+        return -0.5 * (sizes + of_noise), unexplained / dof
 
 
 def weighed(lengths: FloatArray, spreads: list[Spread]) -> Structure:
@@ -104,31 +108,35 @@ def weighed(lengths: FloatArray, spreads: list[Spread]) -> Structure:
     none, noise_of_none = spreads[0].likelihood(0.0)  # the same for all lengths
     finer = _finer(lengths, FINE_LENGTH), _finer(RATIOS, FINE_RATIO)
     of_some = _between(lengths, likelihood, finer)
-    noise_of_some = np.exp(_between(lengths, np.log(np.maximum(noise, TINY)), finer))
+    log_noise = np.log(np.maximum(noise, TINY))
+    noise_of_some = np.exp(_between(lengths, log_noise, finer))
     largest = max(float(of_some.max()), none)
     # No structure and some are as likely beforehand; of some, each ratio and length.
     share = np.exp(of_some - largest) / of_some.size
-    if math.exp(none - largest) >= float(share.sum()):
+    some = float(share.sum())
+    likely = some / (some + math.exp(none - largest))
+    if likely < UNLIKELY:
         return Structure(lengths, np.zeros(len(lengths)), noise_of_none, math.inf)
-    share /= share.sum()
+    share /= some
     # As of a variance by few readings, whose Student's t has the geometric mean for its scale,
     # nearly.
     evidence = noise_of_some * finer[1]
     middle = float((share * np.log(evidence)).sum())
     scatter = float((share * (np.log(evidence) - middle) ** 2).sum())
     variance = (share * evidence).sum(axis=1)
-    return Structure(
-        finer[0],
-        variance * math.exp(middle) / variance.sum(),
-        float((share * noise_of_some).sum()),
-        max(2 / max(scatter, TINY), MIN_DOF),
-    )
+    # What the residuals hardly show may still move a fit: its variance counts by how likely it is.
+    variance *= likely * math.exp(middle) / variance.sum()
+    noise_variance = likely * float((share * noise_of_some).sum())
+    noise_variance += (1 - likely) * noise_of_none
+    dof = max(2 / max(scatter, TINY), MIN_DOF)
+    return Structure(finer[0], variance, noise_variance, dof)
 
 
 def _finer(values: FloatArray, step: float) -> FloatArray:
     """Values between the first and the last, by a smaller step."""
-    count = math.ceil(math.log(values[-1] / values[0]) / math.log(step)) + 1
-    return np.asarray(np.geomspace(values[0], values[-1], count))
+    first, last = values[0], values[-1]
+    steps = math.ceil(math.log(last / first) / math.log(step))
+    return np.geomspace(first, last, steps + 1)
 
 
 def _between(
@@ -147,10 +155,16 @@ def in_time(t: FloatArray, value: FloatArray, terms: FloatArray) -> Structure:
     basis = np.linalg.qr(terms)[0]
     spreads = []
     for length in lengths:
-        eigen, vectors = np.linalg.eigh(np.exp(-np.abs(t[:, None] - t) / length))
-        eigen = np.maximum(eigen, 0.0)
+        eigen, vectors = _diagonal_in_time(t, length)
         spreads.append(Spread(eigen, vectors.T @ value, vectors.T @ basis))
     return weighed(lengths, spreads)
+
+
+def _diagonal_in_time(t: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (n,) and vectors (n, n) of the correlation of moments (n,)."""
+    apart = np.abs(t[:, None] - t)
+    eigen, vectors = np.linalg.eigh(np.exp(-apart / length))
+    return np.maximum(eigen, 0.0), vectors
 
 
 def lasting_root(t: FloatArray, structure: Structure) -> FloatArray:
@@ -180,7 +194,8 @@ class Cells:
             step = 1.0
             if len(places) > 1:
                 step = float(np.median(np.diff(places)))
-            number = np.rint((at - places[0]) / step).astype(np.intp) // group
+            number = np.rint((at - places[0]) / step).astype(np.intp)
+            number //= group
             count = int(number.max()) + 1
             first = places[0] + step * (group - 1) / 2
             self.middle.append(first + step * group * np.arange(count))
@@ -193,9 +208,12 @@ class Cells:
         self.typical = float(self.count[self.filled].mean())
 
     def lengths(self) -> FloatArray:
-        """Lengths that the lattice can tell, px: from half of a cell to half of its extent."""
+        """Lengths that the lattice can tell, px: from half of a cell to a quarter of its extent.
+
+        Structure that is longer follows the terms of a fit, and no residual tells it.
+        """
         low = min(self.side) / 2
-        high = max(float(np.ptp(middles)) for middles in self.middle) / 2
+        high = max(float(np.ptp(middles)) for middles in self.middle) / 4
         steps = round(math.log(high / low) / math.log(LENGTH_STEP))
         return np.geomspace(low, high, max(steps, 1) + 1)
 
@@ -203,8 +221,9 @@ class Cells:
         """The means (cells, ...) of values (n, ...); 0 in empty cells."""
         sums = np.zeros((self.size, *values.shape[1:]))
         np.add.at(sums, self.index, values)
-        count = np.maximum(self.count, 1).reshape(-1, *[1] * (values.ndim - 1))
-        return np.asarray(sums / count)
+        count = np.maximum(self.count, 1)
+        means = sums.reshape(self.size, -1) / count[:, None]
+        return np.asarray(means.reshape(sums.shape))
 
     def empty(self) -> FloatArray:
         """A term of its own (cells, k) for each empty cell, which takes it out of a fit."""
@@ -217,9 +236,8 @@ class Cells:
         parts = []
         for middle, side in zip(self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 6  # a mean over a cell: its own variance twice
-            between = (middle[:, None] - middle) ** 2
-            correlation = length_px / math.sqrt(wide) * np.exp(-between / (2 * wide))
-            eigen, vectors = np.linalg.eigh(correlation)
+            correlation = _falling(middle[:, None] - middle, wide)
+            eigen, vectors = np.linalg.eigh(length_px / math.sqrt(wide) * correlation)
             parts.append((np.maximum(eigen, 0.0), vectors))
         (down, rows), (along, columns) = parts
         return np.outer(down, along).ravel(), rows, columns
@@ -235,10 +253,16 @@ class Cells:
         parts = []
         for at, middle, side in zip((y_px, x_px), self.middle, self.side, strict=True):
             wide = length_px**2 + side**2 / 12
-            between = (at[:, None] - middle) ** 2
-            parts.append(length_px / math.sqrt(wide) * np.exp(-between / (2 * wide)))
-        both = parts[0][:, :, None] * parts[1][:, None]
+            correlation = _falling(at[:, None] - middle, wide)
+            parts.append(length_px / math.sqrt(wide) * correlation)
+        down, along = parts
+        both = down[:, :, None] * along[:, None]
         return np.asarray(both.reshape(len(x_px), -1))
+
+
+def _falling(apart_px: FloatArray, variance_px2: float) -> FloatArray:
+    """exp(-d^2 / 2 L^2) of distances, by the square of L."""
+    return np.asarray(np.exp(-(apart_px**2) / (2 * variance_px2)))
 
 
 def in_place(
@@ -251,8 +275,10 @@ def in_place(
     cells = Cells(x_px[inside], y_px[inside])
     means = cells.means(values[:, inside].T)
     of_terms = cells.means(terms[:, inside].transpose(1, 0, 2))
-    within = float(((values[:, inside].T - means[cells.index]) ** 2).sum())
-    free = float(len(values) * (len(cells.index) - (cells.count > 0).sum()))
+    about_means = values[:, inside].T - means[cells.index]
+    within = float((about_means**2).sum())
+    more_readings = len(cells.index) - int((cells.count > 0).sum())
+    free = float(len(values) * more_readings)
     scale = math.sqrt(cells.typical)
     lengths = cells.lengths()
     empty = cells.empty()
@@ -262,7 +288,8 @@ def in_place(
         eigen, rows, columns = cells.basis(length)
         value = scale * cells.turned(rows, columns, means)
         turned = scale * cells.turned(rows, columns, of_terms.reshape(cells.size, -1))
-        of_fit = turned.reshape(shape).transpose(1, 0, 2).reshape(-1, shape[2])
+        by_axis = turned.reshape(shape).transpose(1, 0, 2)
+        of_fit = by_axis.reshape(-1, shape[2])
         hidden = np.kron(np.eye(len(values)), cells.turned(rows, columns, empty))
         basis = np.linalg.qr(np.concatenate([of_fit, hidden], axis=1))[0]
         eigens = np.tile(cells.typical * eigen, len(values))
@@ -276,20 +303,25 @@ def _rectangle(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
     """
     cells = Cells(x_px, y_px)
     filled = cells.filled.reshape(len(cells.middle[0]), len(cells.middle[1]))
-    rows, columns = slice(0, filled.shape[0]), slice(0, filled.shape[1])
+    height, width = filled.shape
+    rows = slice(0, height)
+    columns = slice(0, width)
     while filled[rows, columns].mean() <= ENOUGH and filled[rows, columns].size > MIN_CELLS:
         part = filled[rows, columns]
-        up, down = part[0].mean(), part[-1].mean()
-        left, right = part[:, 0].mean(), part[:, -1].mean()
-        emptiest = min(up, down, left, right)
+        up = part[0].mean()
+        down = part[-1].mean()
+        at_left = part[:, 0].mean()
+        at_right = part[:, -1].mean()
+        emptiest = min(up, down, at_left, at_right)
         if emptiest == down:
             rows = slice(rows.start, rows.stop - 1)
         elif emptiest == up:
             rows = slice(rows.start + 1, rows.stop)
-        elif emptiest == right:
+        elif emptiest == at_right:
             columns = slice(columns.start, columns.stop - 1)
         else:
             columns = slice(columns.start + 1, columns.stop)
-    row, column = np.divmod(cells.index, filled.shape[1])
-    inside = (row >= rows.start) & (row < rows.stop)
-    return np.asarray(inside & (column >= columns.start) & (column < columns.stop))
+    row, column = np.divmod(cells.index, width)
+    in_rows = (row >= rows.start) & (row < rows.stop)
+    in_columns = (column >= columns.start) & (column < columns.stop)
+    return np.asarray(in_rows & in_columns)

@@ -114,6 +114,7 @@ def _together(image: FloatArray) -> FloatArray:
 
 
 def _image(sky: Sky) -> FloatArray:
+    """A sky as a linear image (height, width), or (3, height, width). Raises InputError."""
     if isinstance(sky, str | Path):
         return read_frame_fits(Path(sky))
     if isinstance(sky, Frame):

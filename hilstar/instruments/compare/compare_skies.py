@@ -108,7 +108,8 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
                 " numbers"
             )
     if frame.shape != golden.shape:
-        (height, width), (golden_height, golden_width) = frame.shape[-2:], golden.shape[-2:]
+        height, width = frame.shape[-2:]
+        golden_height, golden_width = golden.shape[-2:]
         raise InputError(
             f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give"
             " images of one monitor"
@@ -147,7 +148,8 @@ class _SkyFit:
     def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
         self.psf = psf
-        self.templates = star_fit.StarTemplates(places_px, psf, (image.shape[0], image.shape[1]))
+        height, width = image.shape
+        self.templates = star_fit.StarTemplates(places_px, psf, (height, width))
         fitted = self.templates.fit(image)
         self.flux = fitted[:, 0]
         self.places_px = places_px + star_fit.shifts_px(fitted)
@@ -162,8 +164,9 @@ class _SkyFit:
         for _ in range(MOVE_STEPS):
             move = fit.places_px - self.places_px
             shift_px = np.hypot(*move.T)
-            moved = (fit.flux > MISSING_SHARE * self.flux) & (shift_px > SMALL_MOVE_PX)
-            moved &= shift_px <= max_move_px
+            is_there = fit.flux > MISSING_SHARE * self.flux
+            is_move = (shift_px > SMALL_MOVE_PX) & (shift_px <= max_move_px)
+            moved = is_there & is_move
             if not moved.any():
                 break
             places_px = start + np.where(moved[:, None], move, 0.0)
@@ -181,8 +184,9 @@ def _differences(
     limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
     limit_px = np.maximum(place_error_px, limits.centroid_px)
     shift = moved.places_px - fit.places_px
+    max_move_px = MAX_MOVE_SIGMAS * max(fit.psf.width_px)
     gone = moved.flux <= MISSING_SHARE * fit.flux
-    gone |= np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.psf.width_px)
+    gone |= np.hypot(*shift.T) > max_move_px
     ratio = np.where(gone, 1.0, moved.flux / fit.flux)
     error_mag = np.where(gone, np.inf, magnitude(ratio))
     shift_px = np.where(gone, 0.0, shift.T)
@@ -203,14 +207,17 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
     the image may be as bright as any on it, and its wing wrong by that star's rounding.
     """
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
-    floor = star_fit.RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
-    rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
+    brighter = np.maximum(fit.light, moved.light)
+    floor = star_fit.RIPPLE_SHARE * brighter + 0.5 * change
+    largest_flux = max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
+    rounding = PIXEL_ERROR * largest_flux
     limit = star_fit.around(floor, fit.psf) + rounding
     bright = star_fit.bright_pixels(light, limit)
     seeds = star_fit.nameless_seeds(bright, fit.psf).places_px
     places = star_fit.refined(light, seeds, fit.psf)
-    shape = (light.shape[0], light.shape[1])
-    flux = star_fit.StarTemplates(places, fit.psf, shape).fit(light)[:, 0]
+    height, width = light.shape
+    templates = star_fit.StarTemplates(places, fit.psf, (height, width))
+    flux = templates.fit(light)[:, 0]
     column, row = seeds.astype(np.intp).T
     # Two stars at one place: the fit may give one too much and the other less than 0.
     return places, np.maximum(flux, light[row, column])

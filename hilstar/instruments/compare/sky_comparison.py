@@ -57,9 +57,11 @@ def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) 
         motion = fitted_motion(places, moves, rank)
         then_px = np.hypot(*(moves - motion(places)).T)
         explained = (then_px <= limits_px).mean()
-        more = explained > (rest_px <= limits_px).mean() + MORE_STARS
+        explained_before = (rest_px <= limits_px).mean()
+        more = explained > explained_before + MORE_STARS
         median_px = np.median(rest_px)
-        nearer = median_px > limit_px and np.median(then_px) < MIN_SHARE * median_px
+        is_off = median_px > limit_px
+        nearer = is_off and np.median(then_px) < MIN_SHARE * median_px
         if rank == 1 or more or nearer:
             best = motion
             rest_px = then_px
@@ -100,6 +102,7 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
     coefficients = _least_absolute(design, wanted, FINEST_PX / scale)
 
     def motion(at: FloatArray) -> FloatArray:
+        """The moves (n, 2) of places (n, 2)."""
         x, y = at.T / scale
         right, down, *more = coefficients
         if rank == 1:
@@ -217,9 +220,9 @@ class CommonChange:
     """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes
     (positive: too faint).
 
-    A figure is 0 where the stars do not have it in common.
-    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image
-    has. Stars that the shift brought into view or took out of it are in neither.
+    A figure is 0 where the stars do not have it in common. `beyond` are the stars of both images
+    once that is subtracted, `alone` those that only one image has. Stars that the shift brought
+    into view or took out of it are in neither.
     """
 
     shift_px: tuple[float, float]
@@ -292,7 +295,8 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
         return None
     model = motion or np.zeros_like
     beyond = []
-    for star, (dx_px, dy_px) in zip(both, (moves - model(places)).tolist(), strict=True):
+    rest_px = moves - model(places)
+    for star, (dx_px, dy_px) in zip(both, rest_px.tolist(), strict=True):
         error_mag = star.flux_error_mag - flux_mag
         beyond.append(replace(star, flux_error_mag=error_mag, dx_px=dx_px, dy_px=dy_px))
     matched_extra = set(pairs.values())
@@ -304,9 +308,11 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
         move = model(place)
         if star.kind == "extra":
             move = -move
-        if not move.any() or (np.abs(place + move) <= middle - EDGE_PX).all():
+        is_shown = np.abs(place + move) <= middle - EDGE_PX
+        if not move.any() or is_shown.all():
             in_view.append(star)
-    shift_px, rotation_deg, scale_error = _in_the_middle(model, middle, float(np.median(limits_px)))
+    limit_px = float(np.median(limits_px))
+    shift_px, rotation_deg, scale_error = _in_the_middle(model, middle, limit_px)
     return CommonChange(shift_px, rotation_deg, scale_error, flux_mag, beyond, in_view)
 
 
@@ -338,11 +344,13 @@ def _in_the_middle(
     no star by more than its limit.
     """
     reach_px = float(np.hypot(*middle))
-    shift, right, down = motion(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    steps_px = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    shift, right, down = motion(steps_px)
     xx, yx = right - shift
     xy, yy = down - shift
     turn_rad = math.atan2(yx - xy, 2 + xx + yy)
-    scale_error = math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
+    area = (1 + xx) * (1 + yy) - xy * yx
+    scale_error = math.sqrt(area) - 1
     shift_px = (float(shift[0]), float(shift[1]))
     if np.hypot(*shift) <= limit_px:
         shift_px = (0.0, 0.0)
@@ -372,7 +380,8 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
         # Those that are each other's nearest, within PAIR_PX.
         distances_px, nearest = nearest_places(new, predicted)
         _, back = nearest_places(predicted, new)
-        mutual = (distances_px <= PAIR_PX) & (back[nearest] == np.arange(len(old)))
+        is_mutual = back[nearest] == np.arange(len(old))
+        mutual = is_mutual & (distances_px <= PAIR_PX)
         before = np.flatnonzero(mutual)
         after = nearest[before]
         pairs = list(zip(before.tolist(), after.tolist(), strict=True))
@@ -390,15 +399,18 @@ def _brightest(stars: list[StarDifference]) -> FloatArray:
 
 def _displacements(before: FloatArray, after: FloatArray) -> FloatArray:
     """The displacements (n m, 2) from each of n places to each of m others."""
-    return (after[None, :] - before[:, None]).reshape(-1, 2)
+    displacements = after[None, :] - before[:, None]
+    return displacements.reshape(-1, 2)
 
 
 def _places(stars: list[StarDifference]) -> FloatArray:
     """The places (n, 2) of stars, px."""
-    return np.array([(star.x_px, star.y_px) for star in stars]).reshape(-1, 2)
+    places = [(star.x_px, star.y_px) for star in stars]
+    return np.array(places).reshape(-1, 2)
 
 
 def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
+    """By the error over its limit, the largest first, and of equal ones the brightest."""
     return sorted(stars, key=lambda star: (-star.error_over_limit, -star.flux_e_per_s))
 
 

@@ -77,10 +77,13 @@ class StarTemplates:
             across = getattr(self._x, x_name)
             columns.append(down[:, :, None] * across[:, None, :])
         data = np.stack(columns, axis=1)
-        pixel = self._y.clipped[:, :, None] * self.shape[1] + self._x.clipped[:, None, :]
-        index = np.broadcast_to(pixel[:, None], data.shape).ravel()
-        ends = np.arange(3 * size + 1) * math.prod(data.shape[2:])
-        return csc_array((data.ravel(), index, ends), shape=(math.prod(self.shape), 3 * size))
+        height, width = self.shape
+        pixel = self._y.clipped[:, :, None] * width + self._x.clipped[:, None, :]
+        index = np.broadcast_to(pixel[:, None], data.shape)
+        pixels_of_star = math.prod(data.shape[2:])
+        ends = np.arange(3 * size + 1) * pixels_of_star
+        content = (data.ravel(), index.ravel(), ends)
+        return csc_array(content, shape=(height * width, 3 * size))
 
     @cached_property
     def normal(self) -> csc_array:
@@ -90,12 +93,12 @@ class StarTemplates:
         size = len(self.places_px)
         width = self._x.share.shape[1]
         middles = np.column_stack([self._x.middle, self._y.middle])
-        near = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray")
-        near = near.astype(np.intp)
+        pairs = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray")
+        first, second = pairs.astype(np.intp).T
         # each star with itself, and each pair both ways round
         itself = np.arange(size)
-        star = np.concatenate([itself, near[:, 0], near[:, 1]])
-        other = np.concatenate([itself, near[:, 1], near[:, 0]])
+        star = np.concatenate([itself, first, second])
+        other = np.concatenate([itself, second, first])
         along_x = self._x.overlaps(star, other)
         along_y = self._y.overlaps(star, other)
         number_of = {"share": 0, "slope": 1}
@@ -119,7 +122,9 @@ class StarTemplates:
     def _solver(self) -> SuperLU:
         """The factors of the normal equations of unit columns."""
         unit = self.normal.copy()
-        unit.data *= self._scale[unit.indices] * np.repeat(self._scale, np.diff(unit.indptr))
+        row_scale = self._scale[unit.indices]
+        column_scale = np.repeat(self._scale, np.diff(unit.indptr))
+        unit.data *= row_scale * column_scale
         ridge = RIDGE * eye_array(len(self._scale), format="csc")
         return splu(csc_array(unit + ridge))
 
@@ -143,11 +148,12 @@ class StarTemplates:
         """
         size = len(flux)
         entries = self.normal.tocoo()
-        row_star, row_term = entries.row // 3, entries.row % 3
-        col_star, col_term = entries.col // 3, entries.col % 3
+        row_star, row_term = np.divmod(entries.row, 3)
+        col_star, col_term = np.divmod(entries.col, 3)
+        itself = np.flatnonzero(row_star == col_star)
+        place = (row_star[itself], row_term[itself], col_term[itself])
         blocks = np.zeros((size, 3, 3))
-        itself = row_star == col_star
-        blocks[row_star[itself], row_term[itself], col_term[itself]] = entries.data[itself]
+        blocks[place] = entries.data[itself]
         covariance = np.linalg.pinv(blocks, hermitian=True)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         fluxes = row_term + col_term == 0
@@ -156,7 +162,8 @@ class StarTemplates:
         around = pixel_error * near
         with np.errstate(divide="ignore", invalid="ignore"):
             flux_error = np.sqrt(variance[:, 0]) * around
-            place_error_px = np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
+            shift_error = np.sqrt(variance[:, 1:].sum(axis=1)) * around
+            place_error_px = shift_error / np.abs(flux)
         return flux_error, place_error_px
 
 
@@ -171,8 +178,9 @@ class _Profiles:
     def __init__(self, place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> None:
         self.middle = np.rint(place_px).astype(np.intp)
         pixel = self.middle[:, None] + np.arange(-reach_px, reach_px + 1)
-        near = (pixel - place_px[:, None] - 0.5) / sigma_px
-        far = (pixel - place_px[:, None] + 0.5) / sigma_px
+        from_star_px = pixel - place_px[:, None]
+        near = (from_star_px - 0.5) / sigma_px
+        far = (from_star_px + 0.5) / sigma_px
         inside = (pixel >= 0) & (pixel < size_px)
         self.share = (ndtr(far) - ndtr(near)) * inside
         self.slope = (_bell(near) - _bell(far)) / sigma_px * inside
@@ -202,7 +210,8 @@ def bright_pixels(image: FloatArray, floor: FloatArray) -> FloatArray:
     top = (image > floor) & is_peak
     row, column = np.nonzero(top)
     order = np.argsort(-image[row, column], kind="stable")
-    return np.column_stack([column, row])[order].astype(np.float64)
+    places = np.column_stack([column[order], row[order]])
+    return places.astype(np.float64)
 
 
 def around(image: FloatArray, psf: Psf) -> FloatArray:
@@ -217,8 +226,10 @@ def star_psf(image: FloatArray) -> GaussianPsf:
     # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own
     # 1/12 px^2 is subtracted.
     power = np.vdot(image, image)
-    x = _sigma_px(float(np.vdot(image[:, 1:], image[:, :-1]) / power))
-    y = _sigma_px(float(np.vdot(image[1:], image[:-1]) / power))
+    along_x = np.vdot(image[:, 1:], image[:, :-1]) / power
+    along_y = np.vdot(image[1:], image[:-1]) / power
+    x = _sigma_px(float(along_x))
+    y = _sigma_px(float(along_y))
     first = GaussianPsf((x, y))
     bright = bright_pixels(image, RIPPLE_SHARE * around(image, first))
     height, width = image.shape
@@ -260,7 +271,8 @@ def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) 
     distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
     last = np.array(size_px) - 1
     edge = np.minimum(bright, last - bright).min(axis=1)
-    alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
+    near_stars = (distance < distance_px).sum(axis=1)  # each is its own neighbour
+    alone = (near_stars == 1) & (edge >= distance_px / 2)
     if alone.any():
         bright = bright[alone]
     return bright[:SIGMA_STARS].copy()
@@ -271,13 +283,15 @@ def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
     well: all stars at once.
     """
     start = places_px
-    shape = (image.shape[0], image.shape[1])
-    last = np.array([shape[1] - 1, shape[0] - 1])
+    height, width = image.shape
+    last = np.array([width - 1, height - 1])
     outwards = BEYOND_SIGMAS * np.array(psf.width_px)
-    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
-    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + MAX_OFFSET_PX)
+    first_outside = np.minimum(start, 0) - outwards
+    last_outside = np.maximum(start, last) + outwards
+    low = np.where(start < 0.5, first_outside, start - MAX_OFFSET_PX)
+    high = np.where(start > last - 0.5, last_outside, start + MAX_OFFSET_PX)
     for _ in range(MAX_PLACE_STEPS):
-        fitted = StarTemplates(places_px, psf, shape).fit(image)
+        fitted = StarTemplates(places_px, psf, (height, width)).fit(image)
         step = np.clip(shifts_px(fitted), -MAX_STEP_PX, MAX_STEP_PX)
         before = places_px
         places_px = np.clip(places_px + step, low, high)
@@ -309,7 +323,8 @@ class Seeds:
 
     def only(self, chosen: npt.NDArray[np.bool_]) -> "Seeds":
         """The seeds (n,) that are chosen."""
-        return Seeds(self.places_px[chosen], list(itertools.compress(self.hip, chosen)))
+        hip = list(itertools.compress(self.hip, chosen))
+        return Seeds(self.places_px[chosen], hip)
 
 
 def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
@@ -327,10 +342,12 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
         )
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
     places = _places_px(table)
-    listed = _blended(Seeds(places, [_name_of(row) for row in table]), blend_px)
+    names = list(map(_name_of, table))
+    listed = _blended(Seeds(places, names), blend_px)
     # The light of a star off the image is brightest at the image's edge.
     height, width = golden.shape
-    shown = np.clip(places, 0, np.array([width, height]) - 1)
+    last = np.array([width - 1, height - 1])
+    shown = np.clip(places, 0, last)
     distance_px, _ = nearest_places(shown, bright)
     unlisted = nameless_seeds(bright[distance_px > blend_px], psf)
     every_place = np.concatenate([listed.places_px, unlisted.places_px])
@@ -339,12 +356,14 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
 
 def nameless_seeds(places_px: FloatArray, psf: Psf) -> Seeds:
     """Seeds at places (n, 2), px, brightest first; those closer than a blend are one."""
-    return _blended(Seeds(places_px, [()] * len(places_px)), blend_distance_px(psf))
+    nameless = Seeds(places_px, [()] * len(places_px))
+    return _blended(nameless, blend_distance_px(psf))
 
 
 def blend_distance_px(psf: Psf) -> float:
     """The distance within which two stars are one blend."""
-    return max(BLEND_SIGMAS * max(psf.width_px), BLEND_PX)
+    widest_px = max(psf.width_px)
+    return max(BLEND_SIGMAS * widest_px, BLEND_PX)
 
 
 def describes(truth: Truth, image: FloatArray) -> bool:
@@ -383,6 +402,7 @@ def _has(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
 
 
 def _places_px(truth: Truth) -> FloatArray:
+    """The places (n, 2), px, of a table's stars."""
     return np.column_stack([truth["x_px"], truth["y_px"]])
 
 
@@ -396,8 +416,8 @@ def _blended(seeds: Seeds, blend_px: float) -> Seeds:
     """One seed for each chain of near ones, at the place of its first, which is its brightest."""
     size = len(seeds.places_px)
     pairs = cKDTree(seeds.places_px).query_pairs(blend_px, output_type="ndarray")
-    first_ends, second_ends = pairs[:, 0], pairs[:, 1]
-    links = coo_array((np.ones(len(pairs)), (first_ends, second_ends)), shape=(size, size))
+    ends = (pairs[:, 0], pairs[:, 1])
+    links = coo_array((np.ones(len(pairs)), ends), shape=(size, size))
     group = np.zeros(size, dtype=np.intp)
     if size:
         _, labels = connected_components(links, directed=False)
@@ -406,4 +426,5 @@ def _blended(seeds: Seeds, blend_px: float) -> Seeds:
     hips: dict[int, tuple[int | str, ...]] = {}
     for label, hip in zip(group.tolist(), seeds.hip, strict=True):
         hips[label] = hips.get(label, ()) + hip
-    return Seeds(seeds.places_px[first], [hips[label] for label in group[first].tolist()])
+    first_hips = [hips[label] for label in group[first].tolist()]
+    return Seeds(seeds.places_px[first], first_hips)

@@ -404,6 +404,9 @@ def _single(sigmas: FloatArray, x_px: FloatArray, y_px: FloatArray) -> BoolArray
     highest = patch.argmax(axis=1)
     row = middle_row + highest // 3 + margin - 1
     column = middle_column + highest % 3 + margin - 1
-    beside = [padded[row + dy, column + dx] for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+    beside = []
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        beside.append(padded[row + dy, column + dx])
     # 0.75 is 1.5 sigmas of the noise of a mean of four
-    return np.asarray(np.mean(beside, axis=0) + 0.75 < 0.04 * padded[row, column])
+    highest_beside = np.mean(beside, axis=0) + 0.75
+    return np.asarray(highest_beside < 0.04 * padded[row, column])

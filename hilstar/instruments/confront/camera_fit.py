@@ -618,9 +618,8 @@ def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: f
     tangent = min(max(tangent, 0.3), 3.0)
     fits = []
     for sign in (1, -1):
-        x = sign * tangent * math.cos(angle_rad)
-        y = sign * tangent * math.sin(angle_rad)
-        start = replace(pointing, zenith=(x, y))
+        zenith = (sign * tangent * math.cos(angle_rad), sign * tangent * math.sin(angle_rad))
+        start = replace(pointing, zenith=zenith)
         _, fitted, _ = fit_model(camera, [start], [places], (), floor_px)
         fits.append(fitted[0])
     return min(fits, key=lambda trial: float(np.minimum(off(trial) ** 2, 9).sum()))

@@ -89,7 +89,7 @@ class _Sightings:
     @property
     def bv_mag(self) -> FloatArray:
         """B-V (n,), 0 where it is not known."""
-        return np.nan_to_num(np.array([row.b_v_mag for row in self.rows]))
+        return np.asarray(np.nan_to_num([row.b_v_mag for row in self.rows]))
 
     @property
     def phases(self) -> FloatArray:

@@ -86,7 +86,12 @@ class StarRow:
     @property
     def counted(self) -> bool:
         """Whether it counts in rms errors: to V = 6.5, alone, not saturated."""
-        return self.v_mag <= BRIGHT_V_MAG and not NOT_COUNTED & set(self.flags) and self.dn > 0
+        return self.v_mag <= BRIGHT_V_MAG and self.stands_alone and self.dn > 0
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether nothing spoils its figures: saturation, a neighbour, a cloud."""
+        return not NOT_COUNTED & set(self.flags)
 
     @property
     def figures(self) -> tuple[float, ...]:
@@ -305,7 +310,7 @@ class Judge:
         if session.light.colours.any() or shot.photo.plane:
             plane_mag = session.plane_mag(number, shot.sky.columns(stars.row))
             rate = rate * flux_ratio(plane_mag)
-        # the simulator's stars are sorted by brightness, a catalogue's are by row
+        # the simulator's stars are sorted by cell of the sky, a catalogue's are by row
         by_row = []
         for column in (pointing.seen(stars.vectors), stars.temperature_k, rate):
             ordered = np.empty_like(column)
@@ -386,14 +391,18 @@ class Judge:
         """
         shot = self.session.shots[number]
         sources = shot.sources
+        satellites = {}
+        if sources.trail.any():
+            satellites = self._satellites(number)
+        hot = ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
         explanation = _Explanation(
             shot=shot,
             expected=expected,
             tree=_tree_of(expected),
             planets=self._planets(number),
-            satellites=self._satellites(number) if sources.trail.any() else {},
+            satellites=satellites,
             near_saturated=_saturated(shot),
-            hot=ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS),
+            hot=hot,
             light_sigma=light_sigma,
             pixel_dn=math.sqrt(self._pixel_variance(shot)),
             focal_length_px=self.session.camera.camera.focal_length_px,
@@ -719,7 +728,7 @@ def _is_trusted(row: StarRow) -> bool:
     """Whether a star tells of its part of the image: missing, or bright and alone."""
     if "missing" in row.flags:
         return True
-    return not NOT_COUNTED & set(row.flags) and row.dn > EXPECTED_SNR * row.sigma_dn
+    return row.stands_alone and row.dn > EXPECTED_SNR * row.sigma_dn
 
 
 def _cell(row: StarRow, size_px: tuple[int, int]) -> Cell:

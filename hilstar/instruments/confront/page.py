@@ -34,7 +34,6 @@ from hilstar.basics.pages import (
 from hilstar.instruments.confront.excess import Excess
 from hilstar.instruments.confront.judge import (
     LISTED_SNR,
-    NOT_COUNTED,
     SourceRow,
     StarRow,
 )
@@ -281,7 +280,7 @@ def _charts(found: Confronted, pictures: Sequence[Pictures]) -> Iterator[tuple[s
     rows = []
     for verdict in found.verdicts:
         for row in verdict.stars:
-            if row.dn > 0 and row.dn_predicted > 0 and not NOT_COUNTED & set(row.flags):
+            if row.dn > 0 and row.dn_predicted > 0 and row.stands_alone:
                 rows.append(row)
     if rows:
         yield "Flux and colour", _flux(found, rows)

@@ -77,8 +77,8 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
     """
     off = dn - level
     is_free = ~star
-    across = _block_points(off[:, 1:] - off[:, :-1], is_free[:, 1:] & is_free[:, :-1], level)
-    down = _block_points(off[1:] - off[:-1], is_free[1:] & is_free[:-1], level)
+    across = _block_points(np.diff(off, axis=1), is_free[:, 1:] & is_free[:, :-1], level)
+    down = _block_points(np.diff(off, axis=0), is_free[1:] & is_free[:-1], level)
     return np.concatenate([across, down])
 
 
@@ -96,7 +96,7 @@ def _block_points(difference: FloatArray, use: BoolArray, level: FloatArray) -> 
     squares = (differences**2 * uses).sum(axis=1) / np.maximum(count, 1)
     # a difference has the noise of two pixels
     points = np.column_stack([levels.mean(axis=1), squares / 2])
-    return points[count > BLOCK_PX**2 / 2]
+    return np.asarray(points[count > BLOCK_PX**2 / 2])
 
 
 def _in_blocks(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -134,7 +134,7 @@ def fit_pixels(
     line_variance = (column_dn**2 + row_dn**2) / 2
     pattern_variance = pattern.variance_dn2(np.maximum(light_dn, 0))
     variance = all_variance - pattern_variance + line_variance
-    notes = ()
+    notes: tuple[str, ...] = ()
     if note:
         notes = (note,)
     bench = replace(

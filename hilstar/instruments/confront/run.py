@@ -22,7 +22,7 @@ from hilstar.instruments.confront.measured_bench import (
 )
 from hilstar.instruments.confront.page import Pictures, page_pictures, write_page
 from hilstar.instruments.confront.report import Confronted, failures_of, lines_of, words_of
-from hilstar.instruments.confront.session import Session, run_session
+from hilstar.instruments.confront.session import Advance, Session, run_session
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import tracker_camera
@@ -46,6 +46,8 @@ STAR_COLUMNS = (
 )
 SOURCE_COLUMNS = ("image", "x_px", "y_px", "snr", "explained_by")
 MAX_HOT_ROWS = 1000
+# done by time, once the simulator is ready, and the photographs are judged
+SIMULATOR_PERCENT, JUDGED_PERCENT = 88, 94
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +71,12 @@ def confront(
     at_ns: int | None = None,
     fixed: bool = False,
     tell: Callable[[str], None] = lambda line: None,
+    advance: Advance = lambda percent: None,
 ) -> Confronted:
     """Confront photographs with a bench's tracker and write DIR's files. Raises InputError: what
     is wrong, and what to do.
+
+    `tell` is given a line for each photograph, and `advance` what is done, percent.
     """
     file, has_screen = read_tracker_file(bench)
     photos = _read(file, images, at_ns)
@@ -79,20 +84,22 @@ def confront(
     if fixed:
         fixed_optics = fixed_camera(file, max(photo.step_dn for photo in photos))
     try:
-        session = run_session(file, photos, _base(file, photos), start, fixed=fixed_optics)
+        session = run_session(
+            file, photos, _base(file, photos), start, fixed=fixed_optics, advance=advance
+        )
     except np.linalg.LinAlgError as error:
         raise InputError(
             f"{photos[0].path}: its levels allow no fit ({error}); give raw frames, 8 to 16 bits of"
             " grey"
         ) from error
     make_directory(output)
-    names = OUTPUTS
+    names: tuple[str, ...] = OUTPUTS
     if fixed and has_screen:
         tracker = bench
         names = RESULTS
     else:
         tracker = write_tracker(output, session, has_screen)
-    judgement = _judge(session, tracker, tell)
+    judgement = _judge(session, tracker, tell, advance)
     excess = split_excess(session, judgement.verdicts)
     lines = lines_of(session, judgement.verdicts, excess, judgement.defects)
     result = Confronted(
@@ -108,6 +115,7 @@ def confront(
     _write_stars(output / "stars.csv", judgement.verdicts)
     _write_sources(output / "sources.csv", judgement)
     write_page(output / "index.html", result, judgement.pictures)
+    advance(100)
     return result
 
 
@@ -135,14 +143,19 @@ def _read(file: BenchFile, images: Sequence[Path], at_ns: int | None) -> list[Ph
     return [replace(photo, full_dn=full_dn) for photo in photos]
 
 
-def _judge(session: Session, tracker: Path, tell: Callable[[str], None]) -> _Judgement:
+def _judge(
+    session: Session, tracker: Path, tell: Callable[[str], None], advance: Advance
+) -> _Judgement:
     """Judge each photograph by what `simulate` predicts of it with a tracker file."""
     judge = Judge(session, tracker)
     verdicts = []
     pictures = []
     nothing = np.empty((0, 0))
+    count = len(session.shots)
     try:
-        for number in range(len(session.shots)):
+        for number in range(count):
+            judged_percent = (JUDGED_PERCENT - SIMULATOR_PERCENT) * number // count
+            advance(SIMULATOR_PERCENT + judged_percent)
             verdict = judge.of(number)
             pictures.append(page_pictures(session, verdict))
             # its images take as much memory as all that stays of it

@@ -3,7 +3,7 @@ photographs together.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -101,6 +101,9 @@ LINEAR_DONE = 0.004
 MAX_TONE_STEP, MIN_POWER = 0.4, 0.1
 PIVOT_NM = 550.0
 KNOT_NM = 20.0
+# done of a confrontation, percent, by its time: once photographs are open, and the camera is fitted
+OPEN_PERCENT, FITTED_PERCENT = 8, 65
+Advance = Callable[[int], None]
 
 
 @dataclass(slots=True)
@@ -330,13 +333,18 @@ def run_session(
     start: FloatArray | None,
     *,
     fixed: "FixedCamera | None" = None,
+    advance: Advance = lambda percent: None,
 ) -> Session:
     """Everything about photographs of one camera; with `fixed` that camera, to which only attitudes
     and offsets are fitted.
 
-    Raises InputError for a photograph without an attitude.
+    `advance` is told what is done, percent, up to FITTED_PERCENT. Raises InputError for a
+    photograph without an attitude.
     """
-    shots = [open_shot(file, photo, base, start) for photo in photos]
+    shots = []
+    for photo in photos:
+        shots.append(open_shot(file, photo, base, start))
+        advance(OPEN_PERCENT * len(shots) // len(photos))
     focal_px = float(np.median([shot.focal_length_px for shot in shots]))
     if fixed is None:
         base = replace(base, focal_length_px=focal_px)
@@ -347,7 +355,7 @@ def run_session(
     else:
         air = site_air(file.config, file.folder, shots[0].sky.catalog)
     fit = partial(_fitted, file, base, fixed, air)
-    session = fit(shots)
+    session = fit(shots, advance=advance)
     linearity = session.light.linearity
     if fixed is not None or linearity < MIN_POWER:
         return session
@@ -422,6 +430,7 @@ def _fitted(
     *,
     power: float = 1.0,
     before: CameraFit | None = None,
+    advance: Advance = lambda percent: None,
 ) -> Session:
     """The session of shots whose levels were made linear by a power; with the camera `before`,
     of their light alone.
@@ -431,7 +440,7 @@ def _fitted(
     else:
         pixels = fixed.pixels
     if before is None:
-        camera, psf = _geometry(base, fixed, shots, pixels.gain_e_per_dn)
+        camera, psf = _geometry(base, fixed, shots, pixels.gain_e_per_dn, advance)
     else:
         camera = before
         psf = _measured(shots, camera, fixed, pixels.gain_e_per_dn)
@@ -456,7 +465,11 @@ def _fitted(
 
 
 def _geometry(
-    base: Camera, fixed: FixedCamera | None, shots: Sequence[Shot], gain: float
+    base: Camera,
+    fixed: FixedCamera | None,
+    shots: Sequence[Shot],
+    gain: float,
+    advance: Advance,
 ) -> tuple[CameraFit, StarPsf]:
     """The camera and the PSF of shots, whose stars are identified and measured by them, and whose
     pointings are set.
@@ -467,13 +480,16 @@ def _geometry(
     if not is_fixed:
         places, pointings = _outward(base, pointings, shots, places)
     camera = fit_camera(base, pointings, places, fixed=is_fixed, last=False)
+    pass_percent = (FITTED_PERCENT - OPEN_PERCENT) // (PASSES + 1)
     for number in range(PASSES):
+        advance(OPEN_PERCENT + (number + 1) * pass_percent)
         psf = _measured(shots, camera, fixed, gain)
         places = [_places(shot) for shot in shots]
         is_last = number == PASSES - 1
         camera = fit_camera(base, camera.pointings, places, fixed=is_fixed, last=is_last)
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
+    advance(FITTED_PERCENT)
     return camera, psf
 
 
@@ -580,8 +596,8 @@ def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> 
     star = np.flatnonzero(near_middle)[: len(points)]
     tree = cKDTree(sources.places_px[points])
     star_places_px = np.column_stack([x[star], y[star]])
-    radius_px = NEAR * math.hypot(*shot.photo.size_px)
-    star_index, source = nearest_once(tree, star_places_px, radius_px)
+    match_px = NEAR * math.hypot(*shot.photo.size_px)
+    star_index, source = nearest_once(tree, star_places_px, match_px)
     return _seen_at(shot, star[star_index], points[source])
 
 
@@ -658,8 +674,8 @@ def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
 
 
 def _pedestal(shots: Sequence[Shot]) -> tuple[float, float] | None:
-    """The level without light and its sigma, DN, by the shape of the sky's level over the field,
-    one place a block; None where it does not tell.
+    """The level without light and its sigma, DN, by the photographs' skies at one place of each
+    block; None where these do not tell it.
     """
     height, width = shots[0].photo.dn.shape
     side = shots[0].level.block_px
@@ -722,8 +738,7 @@ def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
     shot.stamps = cut_stamps(shot.above_dn, variance, x_px, y_px, bv_mag)
     # a pixel saturates by all of its DN, the background's too
     total = cut_stamps(shot.photo.dn, variance, x_px, y_px, bv_mag)
-    middle = total.values[:, HALF - 3 : HALF + 4, HALF - 3 : HALF + 4]
-    highest_dn = middle.max(axis=(1, 2))
+    highest_dn = total.middle(3).max(axis=(1, 2))
     shot.saturated = highest_dn >= SATURATED_SHARE * shot.photo.full_dn
 
 
@@ -751,8 +766,7 @@ def _middles(stamps: Stamps) -> tuple[FloatArray, FloatArray]:
     """First places (n,) of stars, x and y: centres of gravity of their stamps' 5 x 5 middle
     pixels.
     """
-    middle = stamps.values[:, HALF - 2 : HALF + 3, HALF - 2 : HALF + 3]
-    light = np.maximum(middle, 0)
+    light = np.maximum(stamps.middle(2), 0)
     total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
     reach = np.arange(-2, 3)
     x_px = stamps.column + light.sum(axis=1) @ reach / total
@@ -796,15 +810,16 @@ def _star_light(shots: Sequence[Shot], camera: Camera) -> StarLight:
         stars = shot.found
         sky = shot.sky
         colour = " rgb".index(shot.photo.plane[:1] or " ")
+        count = len(shot.star)
         part = StarLight(
-            np.full(len(shot.star), number),
-            stars.dn,
-            stars.sigma_dn,
-            sky.v_mag[shot.star],
-            sky.bv_mag[shot.star],
-            radius2_of(camera, stars.x_px, stars.y_px),
-            shot.clean,
-            np.full(len(shot.star), colour),
+            image=np.full(count, number),
+            dn=stars.dn,
+            sigma_dn=stars.sigma_dn,
+            v_mag=sky.v_mag[shot.star],
+            bv_mag=sky.bv_mag[shot.star],
+            radius2=radius2_of(camera, stars.x_px, stars.y_px),
+            clean=shot.clean,
+            plane=np.full(count, colour),
         )
         parts.append(part)
     return join_light(parts)

@@ -190,6 +190,11 @@ class Stamps:
             self.bv_mag[chosen],
         )
 
+    def middle(self, reach: int) -> FloatArray:
+        """Values (n, side, side) of the pixels up to `reach` from the middle one."""
+        near = slice(HALF - reach, HALF + reach + 1)
+        return self.values[:, near, near]
+
     def offsets(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offsets of the pixels' columns and rows from places (n,): dx (n, k) and dy (n, k), px."""
         reach = np.arange(-HALF, HALF + 1)
@@ -333,7 +338,7 @@ def fit_psf(
     psf = StarPsf(start, 0.0, 0.05, 2.0, size_px)
     measured = measure(stamps, psf, x_px, y_px, gain_e_per_dn)
     for number in range(SHAPE_ROUNDS):
-        # colour and wings are told by small residuals: after the core
+        # colour and wings once the core is near
         psf = _shape(stamps, measured, psf, gain_e_per_dn, wide=number > 0)
         moved_px = np.hypot(measured.x_px - x_px, measured.y_px - y_px)
         is_near = moved_px < 2
@@ -358,7 +363,7 @@ def _first_width(stamps: Stamps) -> float:
     """A variance, px^2, from how much of a star's light its highest pixel and the eight about it
     have.
     """
-    middle = stamps.values[:, HALF - 3 : HALF + 4, HALF - 3 : HALF + 4]
+    middle = stamps.middle(3)
     total = np.maximum(middle.sum(axis=(1, 2)), 1e-9)
     peak_share = np.median(middle.max(axis=(1, 2)) / total)
     # a Gaussian's middle pixel has 1 / (2 pi sigma^2) of its light

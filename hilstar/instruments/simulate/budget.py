@@ -30,12 +30,12 @@ from hilstar.tracker.star_errors import Judge, StarErrors
 
 PHASES = 16  # along a side of a pixel
 STEP_MAG = 0.5
-MAX_BELOW_WHITE_MAG = 15.0
-SOLAR_BV, LIKE_SOLAR_BV = 0.65, 0.1
+MAX_BELOW_WHITE_MAG = 15.0  # darker than the last code of 16 bits, 12 mag
+SOLAR_BV, LIKE_SOLAR_BV = 0.65, 0.1  # the Sun's; stars as near to it count as of its colour
 FLUX_LIMITS_MAG = (0.02, 0.05)
 CENTROID_LIMIT_PX = 0.01
 USUAL: Centroider = "fit"  # what most trackers do
-COMPARED_MAG = 6.0
+COMPARED_MAG = 6.0  # below full scale, where kinds of centroiders are compared
 By = Centroider | Literal["all"]
 MAX_NAMED = 20
 RED_NM = 700.0  # beyond it a monitor has next to no light

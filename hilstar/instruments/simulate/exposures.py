@@ -32,8 +32,7 @@ def log_views(
     exposure.
 
     One at each sample, or `frame_count` of them evenly from the first to the last. Within half an
-    exposure of the log's
-    ends the rate is that of the part inside.
+    exposure of the log's ends the rate is that of the part inside.
     """
     timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
     first_ns = samples[0].t_ns

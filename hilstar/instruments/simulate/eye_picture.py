@@ -105,6 +105,7 @@ def sky_under(dn: DigitalNumbers) -> Sky:
 
 
 def _blocks(dn: DigitalNumbers) -> _Blocks:
+    """The medians and the noise of square blocks of a frame."""
     height, width = dn.shape
     side = int(np.clip(min(height, width) // BLOCKS_A_SIDE, MIN_BLOCK_PX, MAX_BLOCK_PX))
     rows = max(height // side, 1)
@@ -124,6 +125,7 @@ def _blocks(dn: DigitalNumbers) -> _Blocks:
 
 
 def _terms(across: FloatArray, down: FloatArray) -> FloatArray:
+    """The terms (n, 6) of a surface of second degree."""
     ones = np.ones_like(across)
     return np.column_stack([ones, across, down, across**2, across * down, down**2])
 

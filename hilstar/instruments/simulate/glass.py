@@ -26,17 +26,22 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
     def of(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         if not psf.by_colour:
             stamps = []
-            for across, down in zip(near - x_px[:, None], near - y_px[:, None], strict=True):
+            for x, y in zip(x_px, y_px, strict=True):
+                across = near - x
+                down = near - y
                 stamps.append(psf.shares(across[None, :], down[:, None]))
             return np.stack(stamps)
-        at_x_px, at_y_px = columns + x_px, rows + y_px
-        light = psf.stamps_at(at_x_px, at_y_px, psf.mean_shares if shares is None else shares)
+        at_x_px = columns + x_px
+        at_y_px = rows + y_px
+        spectra = psf.mean_shares if shares is None else shares
+        light = psf.stamps_at(at_x_px, at_y_px, spectra)
         glass_side = light.shape[1]
         light = np.pad(light, ((0, 0), (1, 1), (1, 1)))
         stars = np.arange(len(x_px))[:, None, None]
         column = _in_glass_square(columns[:, None] + near, at_x_px, glass_side)
         row = _in_glass_square(rows[:, None] + near, at_y_px, glass_side)
-        return np.asarray(light[stars, row[:, :, None], column[:, None, :]], dtype=np.float64)
+        squares = light[stars, row[:, :, None], column[:, None, :]]
+        return np.asarray(squares, dtype=np.float64)
 
     return of
 

@@ -47,6 +47,7 @@ class HeadsErrors:
 
 
 def _figures(errors: list[float]) -> dict[str, float] | None:
+    """The rms and the maximum of errors, None without any."""
     if not errors:
         return None
     rms = np.sqrt(np.mean(np.square(errors)))
@@ -102,7 +103,8 @@ class _Head:
         inside &= _inside(truth["x_px"], truth["y_px"], bench.camera.resolution_px, reach_px)
         rates = truth["electrons_per_s"]
         is_crowded = crowded(x_px, y_px, rates, radius_px, self.finder.psf)
-        is_matched = (sky.index >= 0) & (shown.index >= 0) & ~shared(sky.index)
+        has_both = (sky.index >= 0) & (shown.index >= 0)
+        is_matched = has_both & ~shared(sky.index)
         is_whole = truth["drawn"] & ~truth["clipped"]
         return np.asarray(inside & is_matched & is_whole & ~is_crowded)
 
@@ -139,18 +141,21 @@ def _inside(
 ) -> npt.NDArray[np.bool_]:
     """True for places (n,) farther than a margin from an image's edges."""
     width, height = resolution_px
-    inside = (x_px > margin_px) & (x_px < width - 1 - margin_px)
-    return np.asarray(inside & (y_px > margin_px) & (y_px < height - 1 - margin_px))
+    across = (x_px > margin_px) & (x_px < width - 1 - margin_px)
+    down = (y_px > margin_px) & (y_px < height - 1 - margin_px)
+    return np.asarray(across & down)
 
 
 def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray) -> FloatArray:
     """The rotation (3, 3) that takes unit vectors (n, 3) nearest to others: Wahba's problem by
     Markley's SVD (1988).
     """
-    u, _, vt = np.linalg.svd((weights[:, None] * after).T @ before)
+    weighted = weights[:, None] * after
+    u, _, vt = np.linalg.svd(weighted.T @ before)
     # +1, or -1 where the product would be a reflection
     handedness = np.linalg.det(u) * np.linalg.det(vt)
-    return np.asarray(u @ np.diag([1.0, 1.0, handedness]) @ vt)
+    proper = np.diag([1.0, 1.0, handedness])
+    return np.asarray(u @ proper @ vt)
 
 
 def verify_heads(

@@ -293,6 +293,7 @@ class LiveTracker(Closing):
         return self._answered(Solved(exposed, mode, stars, identified))
 
     def _answered(self, solved: Solved) -> Solved:
+        """The same answer, noted as the last one where it has an attitude."""
         if solved.identified is not None:
             at_ns = solved.exposed.middle_ns
             self._before = self._last
@@ -326,6 +327,9 @@ class LiveTracker(Closing):
     def _found(
         self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None
     ) -> FoundStars:
+        """The stars that the tracker's software finds in an image, by a window as wide as they are
+        smeared.
+        """
         psf_px = software_psf_px(self.canvas.psf.width_px, self.config.tracker.detector)
         across_rad_s = float(np.linalg.norm(self.rate_cam_rad_s()[:2]))
         streak_px = across_rad_s * self.exposure_s * self.camera.focal_length_px

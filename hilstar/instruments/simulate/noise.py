@@ -52,7 +52,7 @@ from hilstar.tracker.mosaic import (
 from hilstar.tracker.settings import DetectorSettings, PixelNoise
 
 PHASES = 6  # along a side of a pixel
-SLOPE_STEP_PX = 1e-3
+SLOPE_STEP_PX = 1e-3  # to either side of a place, for slopes
 CHUNK = 64  # stars at once
 UNSEEN = 0.01  # the probability of detection at which the table of magnitudes ends
 MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars are interpolated
@@ -60,9 +60,9 @@ MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars
 NO_INFORMATION = NO_NOISE_E2 = 1e-12
 # simulated stars of a magnitude along a side of an image; found ones that give an error
 TRIALS, MIN_FOUND = 20, 40
-SKY_FIELDS = 100
+SKY_FIELDS = 100  # at random, of which medians are told
 LIMIT_STEP_MAG = 0.25
-TURN_RAD = 1e-6
+TURN_RAD = 1e-6  # about each axis, for its slopes: 0.2 arcsec
 NO_PLACE_PX = 1e3  # a star whose light never leaves one pixel, or is all clipped
 MIN_STARS = 2  # for an attitude
 # A pattern of four stars is what lost-in-space solvers look up (tetra3's and astrometry.net's).
@@ -125,12 +125,15 @@ class NoisyStar:
         self.side_px = max(psf.footprint_px | 1, 7)
         phase = (np.arange(phases) + 0.5) / phases - 0.5
         columns, rows = np.meshgrid(phase, phase)
-        y_px, x_px = columns.ravel(), rows.ravel()
+        y_px = columns.ravel()
+        x_px = rows.ravel()
         step = SLOPE_STEP_PX
         star_pattern, sky_pattern = self._patterns()
         stamps = self.stamps(x_px, y_px)
-        slope_x = (self.stamps(x_px + step, y_px) - self.stamps(x_px - step, y_px)) / (2 * step)
-        slope_y = (self.stamps(x_px, y_px + step) - self.stamps(x_px, y_px - step)) / (2 * step)
+        change_x = self.stamps(x_px + step, y_px) - self.stamps(x_px - step, y_px)
+        change_y = self.stamps(x_px, y_px + step) - self.stamps(x_px, y_px - step)
+        slope_x = change_x / (2 * step)
+        slope_y = change_y / (2 * step)
         count = phases**2 * len(star_pattern)
         star_pattern = star_pattern[:, None]
         self.shares = (star_pattern * stamps).reshape(count, -1)
@@ -234,10 +237,12 @@ class NoisyStar:
         rows["bound_y_px"] = background_known[:, 1]
         rows["bound_flux_e"] = background_known[:, 2]
         rows["bound_flux_sky_e"] = background_free[:, 2]
-        rows["bound_px"] = np.sqrt((rows["bound_x_px"] ** 2 + rows["bound_y_px"] ** 2) / 2)
+        both_px2 = rows["bound_x_px"] ** 2 + rows["bound_y_px"] ** 2
+        rows["bound_px"] = np.sqrt(both_px2 / 2)
         rows["effective_px"] = effective_px.mean(axis=(1, 2))
         # somewhere within a pixel all pixels of them clip
-        rows[~unclipped.any(axis=-1).all(axis=-1)] = np.nan
+        has_place = unclipped.any(axis=-1).all(axis=-1)
+        rows[~has_place] = np.nan
         rows["star_e"] = star_e[:, 0, 0]
         rows["clipped_px"] = (~unclipped).sum(axis=-1).mean(axis=-1)
         rows["snr"] = rows["star_e"] / rows["total_e"]
@@ -423,7 +428,8 @@ def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -
     nea = np.full((2, len(usable)), np.inf)
     covariance = np.linalg.inv(information[usable])
     x, y, z = covariance.diagonal(axis1=1, axis2=2).T
-    nea[:, usable] = ARCSEC_PER_RAD * np.sqrt([(x + y) / 2, z])
+    across_and_about = np.sqrt([(x + y) / 2, z])
+    nea[:, usable] = ARCSEC_PER_RAD * across_and_about
     return nea
 
 

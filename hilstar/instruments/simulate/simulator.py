@@ -141,9 +141,8 @@ class Simulator(Closing):
     renderer's.
 
     Free it with `close`, or use it as a context manager; one in another's context ends with that.
-    One that
-    does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands for the
-    bench's own.
+    One that does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands
+    for the bench's own.
     """
 
     def __init__(
@@ -290,6 +289,7 @@ class Simulator(Closing):
     def _digitised(
         self, mean_e: FloatArray, rng: np.random.Generator | None
     ) -> npt.NDArray[np.uint16]:
+        """The DN of mean electrons (h, w), with noise by a generator or without."""
         exposure_s = self.config.tracker.exposure_s
         if rng is None:
             return self.detector.expose_noiseless(mean_e, exposure_s)
@@ -595,11 +595,10 @@ class TrackerBackground:
     by direction, sky glow.
 
     Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all
-    channels. Zodiacal light
-    and glow are computed at LATTICE places along each side of the detector, each with its pixel's
-    solid angle. Where the table of zodiacal light is blank, near the Sun, a field is refused
-    (InputError); without `refuse` the nearest tabled light is drawn, and a warning says so once
-    until the field has left that part of the sky.
+    channels. Zodiacal light and glow are computed at LATTICE places along each side of the
+    detector, each with its pixel's solid angle. Where the table of zodiacal light is blank, near
+    the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn,
+    and a warning says so once until the field has left that part of the sky.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ from hilstar.tracker.centroids import (
 from hilstar.tracker.mosaic import software_psf_px
 
 USUAL: Centroider = "window"
-MATCH_PX = 3.0
+MATCH_PX = 3.0  # a find farther from a star's place is not that star
 # Others' light in a star's window, as a share of its own. Both images have it, so its effect is of
 # second order: at
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.

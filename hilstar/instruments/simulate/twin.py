@@ -157,10 +157,9 @@ class TwinField:
     itself, and stars have the electrons of an average pixel of it. `pixels_e` are the detector's
     own of what is shown. `shown_e` is what the monitor as it is makes, `assumed_e` what it would
     make if everything were as assumed (the same array where nothing differs), and `sky_e` what the
-    stars themselves make. `by_channel` has shown and sky of each channel,
-    where primaries are driven apart for several. `under_e` lies under them all. `truth` has the
-    rows of TRUTH_DTYPE of stars and points, and `discs` those bodies' directions (3,), cam, and
-    radii, rad, which are more
+    stars themselves make. `by_channel` has shown and sky of each channel, where primaries are
+    driven apart for several. `under_e` lies under them all. `truth` has the rows of TRUTH_DTYPE of
+    stars and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
     than points.
     """
 

@@ -73,17 +73,17 @@ BODIES: dict[str, tuple[Table, Table]] = {
     "all": ({"planets": True, "moon": True, "sun": True, "earth": True}, LOW_ORBIT),
 }
 FRAME_NS = round(NS_PER_S / REFRESH_HZ)
-SIGMA_PX = (0.85, 0.85)
+SIGMA_PX = (0.85, 0.85)  # of sprites by default
 MIDDLE_PX = (0.2, -0.3)  # disc centre from the middle pixel's centre: off any symmetry
-FOCAL_PX = 6000.0
+FOCAL_PX = 6000.0  # a pixel is 34 arcsec, as on the demo's monitor
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
 QUICK_RADII_PX = (0.1, 2.0, 12.0)
 PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
 # along each side: at most 0.07 px apart, under a tenth of sigma
 MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400
 LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
-PLACES = 60
-MARGIN_PX = 8
+PLACES = 60  # along a limb, where its edge is found
+MARGIN_PX = 8  # around a disc: nine sigmas of its light
 # Degrees from the boresight to the body's middle, of the Earth beyond its limb (negative: on it)
 NEAR_DEG: dict[str, tuple[float, ...]] = {
     "Moon": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
@@ -95,9 +95,10 @@ QUICK_DEG: dict[str, tuple[float, ...]] = {
     "Sun": (40.0, 0.5),
     "Earth": (40.0, 0.0, -70.0),
 }
-ROUNDS, QUICK_ROUNDS = 40, 3
+ROUNDS, QUICK_ROUNDS = 40, 3  # of which the fastest frame counts
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
-FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
+FLUX_LIMIT, LIMB_LIMIT_PX = 0.01, 0.1
+DISC_PX = 0.2  # a body of a smaller diameter is drawn as a point
 FLOOR = 1e-6  # lower end of the chart's axis
 SMALL = {"ms": 4}
 BESIDE_AXIS = (0.3, 1.0, 0.0)  # the Sun stands beside a disc, across this axis
@@ -136,7 +137,9 @@ COST_NOTE = (
 
 @contextmanager
 def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
-    """The benches of these names, which end with the context. Raises InputError or MachineError."""
+    """Open the benches of these names; they close with the context. Raises InputError or
+    MachineError.
+    """
     common: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ, "bits": 12},
@@ -160,8 +163,9 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
 
 
 def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
-    """The attitude (unit quaternion) so far from a body's middle, or beyond the Earth's limb
-    (negative: on it).
+    """The attitude (unit quaternion) that points `off_deg` away from a body's centre.
+
+    Of the Earth the angle counts from its limb, and is negative on its disc.
     """
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
@@ -186,8 +190,9 @@ def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class BodyScene:
-    """A bench by its name, its aim (see `attitude`) from `t_ns` on, and the step of its clock
-    from frame to frame.
+    """What a frame shows: a bench by its name, and its aim `off_deg` from a body (see `attitude`).
+
+    The bench's clock starts at `t_ns` and advances by `step_ns` a frame.
     """
 
     name: str
@@ -199,19 +204,18 @@ class BodyScene:
 
 
 def at_a_step(scene: str) -> bool:
-    """Whether each frame of a scene, by its name, is the first of a step of the orbit."""
+    """Whether every frame of a scene begins a new step of the orbit."""
     by_name = {known.name: known for known in SCENES}
     return by_name[scene].step_ns != FRAME_NS
 
 
 @dataclass(frozen=True, slots=True)
 class BodyCost:
-    """One scene: the fastest frame of the rounds, ms, with the body and without any, and the
-    difference.
+    """The cost of the bodies in one scene: the fastest frame, ms, with and without them.
 
     `cpu_ms` is the difference in processor time of all cores, the driver's threads included. A busy
-    machine changes it least, and in software rendering it is the whole cost. `discs` are the bodies
-    drawn as discs, `stars` counts the stars drawn.
+    machine changes it least, and in software rendering it is the whole cost. `discs` names the
+    bodies that are drawn as discs, `stars` counts the stars drawn.
     """
 
     scene: str
@@ -223,7 +227,7 @@ class BodyCost:
     stars: int
 
 
-SCENES = (
+SCENES: tuple[BodyScene, ...] = (
     BodyScene("from the Earth's centre, no body", "observer", "Moon", 60.0),
     BodyScene("planets, none in view", "planets", "Jupiter", 60.0),
     BodyScene("Uranus in view, a point", "planets", "Uranus", 0.3),
@@ -242,8 +246,9 @@ SCENES = (
 
 
 def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) -> BodyCost:
-    """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all"
-    and the scene's.
+    """Time a scene and the same frame without bodies in turn.
+
+    `benches` holds "nothing", "all" and the scene's own.
     """
     bench = benches[scene.bench]
     aimed = bench
@@ -291,11 +296,11 @@ def shortest(times: Sequence[Spent]) -> Spent:
 
 @dataclass(frozen=True, slots=True)
 class Exactness:
-    """A body of one radius at one phase: its light, the place of its limb (NaN: none) or of its
-    middle, single pixels.
+    """How exact a disc of one radius at one phase is.
 
-    `flux_off` and `pixel_off` are relative to all its light and to its brightest pixel;
-    `point_pixel_off` is that of a point.
+    `flux_off` is relative to its light, `pixel_off` to its brightest pixel; `point_pixel_off` is
+    the error of a point drawn in its place. `limb_off_px` is NaN where the disc is too small or too
+    thin to have a limb.
     """
 
     body: str
@@ -309,7 +314,7 @@ class Exactness:
 
 
 def moon(radius_px: float, phase_deg: float) -> Disc:
-    """A Moon of that radius off the middle of an image."""
+    """A Moon of a radius and phase, off the centre of an image."""
     ahead = middle_direction()
     side = np.cross(ahead, BESIDE_AXIS)
     side /= np.linalg.norm(side)
@@ -354,7 +359,7 @@ def drawn_discs(disc: Disc, camera: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def exactness(radius_px: float, phase_deg: float) -> Exactness:
-    """A Moon as it is drawn, against rays."""
+    """The errors of a Moon as it is drawn, against traced rays."""
     from scipy.ndimage import center_of_mass
 
     disc = moon(radius_px, phase_deg)
@@ -382,8 +387,8 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
 
 
 def traced(disc: Disc, camera: Camera) -> FloatArray:
-    """The image of a disc by rays on a lattice about it, float64, each ray's light spread by the
-    Gaussian over the pixels.
+    """The image (h, w) of a disc by float64 rays on a lattice, each spread over pixels by the
+    Gaussian.
     """
     from scipy.special import ndtr
 
@@ -404,14 +409,15 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
 
 
 def edges_in_sigmas(pixels: int, places_px: FloatArray, sigma_px: float) -> FloatArray:
-    """The edges of a row of pixels from each of some places (n,), in sigmas: (n, pixels + 1)."""
+    """The edges of a row of pixels relative to places (n,), in sigmas: (n, pixels + 1)."""
     edges_px = np.arange(pixels + 1) - 0.5
     return np.asarray((edges_px - places_px[:, None]) / sigma_px)
 
 
 def edges_px(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
-    """Where an image falls to half its light 3 px inside the limb, on the lit side, px outward
-    of the limb.
+    """Where the lit limb of a disc is in an image, px outward of its true place.
+
+    The limb is where light falls to half of its value 3 px inside.
     """
     from scipy.ndimage import map_coordinates
 
@@ -437,12 +443,11 @@ def edges_px(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArra
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """A frame with a body so near its middle: the fastest of some, ms, and in processor time, and
-    without any body.
+    """A frame with a body near its middle: the fastest of some, ms.
 
-    `over_white_mag` is how many magnitudes brighter than white the brightest pixel is (below 0:
-    fainter), `finite` says that every pixel's light is a number, `white_is_white` that each with
-    more than white has white's code; `stars` those drawn.
+    `over_white_mag` is how much brighter than white the brightest pixel is (negative: fainter).
+    `finite` says that every pixel's light is a number, `white_is_white` that each pixel over white
+    has white's code.
     """
 
     body: str
@@ -457,7 +462,10 @@ class Near:
 
 
 def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: int) -> Near:
-    """A body at one place. `benches` has "nothing" and the body's own."""
+    """Time a body at one angle from the boresight, and look at its light.
+
+    `benches` holds "nothing" and the body's own.
+    """
     bench = benches[body]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
     q = attitude(bench, body, off_deg, start_ns)
@@ -517,7 +525,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def unseen_ms(costs: Sequence[BodyCost]) -> float:
-    """The largest cost of bodies that are no discs, between steps of an orbit."""
+    """The largest cost of bodies that are not drawn as discs, between steps of the orbit, ms."""
     largest_ms = 0.0
     for cost in costs:
         if not cost.discs and not at_a_step(cost.scene):
@@ -548,7 +556,7 @@ def size_line(sizes: Sequence[Exactness]) -> str:
 
 
 def limits_line(nears: Sequence[Near]) -> str:
-    """What a near body takes, and its light, in words."""
+    """The slowest frame with a body in view, and what its light does, in words."""
     slowest = max(nears, key=lambda near: near.cpu_ms)
     place = f"{slowest.body} at {slowest.off_deg:g} degrees"
     return (

@@ -57,7 +57,7 @@ BITS = (8, 10, 12)
 # By bits: the largest flux error allowed, mag, and the magnitudes under white over which it is
 # allowed.
 AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
-AIM_PX = 0.01
+AIM_PX = 0.01  # the largest place error allowed, by a PSF fit
 # Rec. 709's shares of white stand in for the primaries as a tracker sees them.
 STEALING_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)
 FRAME_PX = (1920, 1080)
@@ -65,9 +65,9 @@ STARS = 1000
 SEED = 1
 STEALING = ", bit stealing"
 JUDGE: Centroider = "fit"  # as most trackers do
-FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)
+FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)  # of an exposure
 BEGINS = (2.0, 3.4, 5.7, 7.1)  # refreshes: exposures begin within frames too
-AIM_FRAMES = 6
+AIM_FRAMES = 6  # of an exposure of 0.1 s at 60 Hz
 JUDGED: tuple[Centroider, ...] = ("moment", "window", "fit")  # over frames
 MANY_STEPS = 100  # from which on they are written without a decimal
 SMALL = {"ms": 4}
@@ -79,8 +79,8 @@ FRAMES_NOTE = (
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way from light to levels: its name, the renderer's method, its colour, and in how many
-    frames it is seen.
+    """A way from light to levels: its name, the renderer's method, its colour in charts, and the
+    frames of an exposure.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Way:
     frames: int = 1
 
 
-WAYS = (
+WAYS: tuple[Way, ...] = (
     Way("round", "round", PURPLE),
     Way("dither", "dither", ORANGE),
     Way(f"temporal, mean of {EXPOSURE_FRAMES} frames", "temporal", GREEN, frames=EXPOSURE_FRAMES),
@@ -109,8 +109,8 @@ def response_of(bits: int, way: Way) -> Response:
 
 
 def star_field(frame_px: tuple[int, int], footprint_px: int) -> FrameLight:
-    """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as
-    in the one before.
+    """STARS sprites anywhere on a frame over eight magnitudes, three times as many in each as in
+    the one before.
     """
     rng = np.random.default_rng(SEED)
     brightest_share = rng.uniform(size=STARS)
@@ -123,8 +123,9 @@ def star_field(frame_px: tuple[int, int], footprint_px: int) -> FrameLight:
 
 
 def judged_phases(phases: int) -> tuple[FrameLight, int, FloatArray, Judge]:
-    """phases^2 stars whose peak is white, the side of a star's tile, px, their image, and its
-    judge by the usual tracker.
+    """phases^2 stars whose peak is white, one at each place within a pixel, and what judges them.
+
+    Returns sprites, the side of a star's tile, px, their image, and the judge of the usual tracker.
     """
     sprites, tile = phase_grid(phases, USUAL_PSF)
     bright = phase_image(sprites, USUAL_PSF)
@@ -135,8 +136,8 @@ def judged_phases(phases: int) -> tuple[FrameLight, int, FloatArray, Judge]:
 
 
 def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
-    """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the
-    tracker is as usual.
+    """The errors of phases^2 stars at magnitudes under white, on an sRGB panel, by the usual
+    tracker.
     """
     panel = Panel(response_of(bits, way), WHITE)
     balance = Balance(USUAL_PSF, AS_USUAL)
@@ -199,11 +200,10 @@ def error_figures(errors: StarErrors) -> ErrorFigures:
 
 @dataclass(frozen=True, slots=True)
 class OverFrames:
-    """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many
-    frames, places along an axis.
+    """Errors of a star over an exposure of some frames: rms over places within a pixel and starts.
 
-    `steps` is the star's light in steps from black; errors are infinite where a star may show
-    nothing.
+    Places are along one axis. `steps` is the star's light in steps of the panel from black; errors
+    are infinite where a star may show nothing.
     """
 
     panel: str
@@ -219,7 +219,7 @@ class OverFrames:
 
 @dataclass(frozen=True, slots=True)
 class FramesPanel:
-    """A panel on which frames are added up, and how faint the star on it is."""
+    """A panel whose frames are summed, and how faint the star on it is."""
 
     name: str
     response: Response
@@ -262,7 +262,7 @@ def study_frames(directory: Path, quick: bool) -> str:
 def light_to_frames(
     levels_of: Callable[[int], Levels], panel: Panel, shape: tuple[int, ...], frames: int
 ) -> FloatArray:
-    """A panel's light up to the beginning of each frame, and of one more: (frames + 1, h, w)."""
+    """A panel's light up to the start of each frame and of one more: (frames + 1, h, w)."""
     to_frame = np.zeros((frames + 1, *shape))
     for frame in range(frames):
         to_frame[frame + 1] = to_frame[frame] + shown_light(levels_of(frame), panel)
@@ -340,8 +340,9 @@ def panel_of(row: OverFrames) -> str:
 
 
 def error_panel(error: str, ylabel: str) -> PanelSpec:
-    """An error over the frames of an exposure, by `temporal` and by `dither`; the flux's has the
-    steps.
+    """An error against the frames of an exposure, by `temporal` and by `dither`.
+
+    The panel of the flux names each monitor's steps.
     """
     temporal = LineSpec(
         "frames",
@@ -366,7 +367,7 @@ def is_dither(row: OverFrames) -> bool:
 
 
 def steps_words(row: OverFrames) -> str:
-    """A panel, and how many of its steps a star's light is."""
+    """A panel, and the star's light in its steps."""
     decimals = 0
     if row.steps < MANY_STEPS:
         decimals = 1

@@ -123,11 +123,11 @@ PUBLISHED_WIDTH = 1.8
 
 @dataclass(frozen=True, slots=True)
 class GamutRow:
-    """Stars to V = 7 of a panel before a sensor, without codes.
+    """Stars to V = 7 of a panel before a sensor, as its primaries can show them; no codes.
 
-    `out_share` is the share of stars beyond the gamut; `off_...` how far colours are off: the share
-    of electrons in a wrong channel, of one channel nm of the mean wavelength. `subtypes` are off by
-    each star's own mixture, `subtypes_white` by white.
+    `out_share` is the share of stars outside the gamut. `off_...` is the error of colour: the share
+    of electrons in a wrong channel, or for one channel nm of the mean wavelength. `subtypes` is the
+    error with each star's own mixture, `subtypes_white` with white.
     """
 
     panel: str
@@ -143,7 +143,9 @@ class GamutRow:
 
 @dataclass(frozen=True, slots=True)
 class GamutClass:
-    """The same of a mono sensor by spectral class: mean wavelength, and by how much it is off."""
+    """The stars of one spectral class before a mono sensor: their mean wavelength and its error,
+    nm.
+    """
 
     panel: str
     sensor: str
@@ -157,10 +159,10 @@ class GamutClass:
 
 @dataclass(frozen=True, slots=True)
 class ColourChoice:
-    """Lone stars of V = 1 to 5.5 as codes show them.
+    """Lone stars of V = 1 to 5.5 with the codes of one choice.
 
-    Mean errors of colour, and 95 % of the errors of light, mag, of a channel's light, %, and of
-    place, px; the fastest frame.
+    `subtypes` and `off_percent_k` are mean errors of colour; `mag`, `channel` (%) and `px` are what
+    95 % of the stars are within. The times are of the fastest frame.
     """
 
     tracker: str
@@ -178,8 +180,10 @@ class ColourChoice:
 
 @dataclass(frozen=True, slots=True)
 class LateralColour:
-    """Places through a lens against those of a star like the Sun, rms: of the sky, and by how much
-    the shown ones differ. The lens "linear" moves a star by 1 px for 100 nm of its mean wavelength.
+    """The shift of stars' places by a lens's lateral colour, against a star like the Sun, rms.
+
+    `sky_px` is the sky's own, `off_px` the error of the shown one. The lens "linear" moves a star
+    by 1 px for 100 nm of its mean wavelength.
     """
 
     lens: str
@@ -192,7 +196,7 @@ class LateralColour:
 
 @dataclass(frozen=True, slots=True)
 class MosaicPlaces:
-    """Errors of a noiseless star's place along an axis, over places in four pixels."""
+    """Errors of a noiseless star's place along an axis, over places within two by two pixels."""
 
     sigma_px: float
     temperature_k: float
@@ -203,7 +207,7 @@ class MosaicPlaces:
 
 @dataclass(frozen=True, slots=True)
 class GamutStars:
-    """The stars (n,) of a panel before a sensor: what is wanted of each, and how far it is off."""
+    """The stars (n,) of a panel before a sensor: the wanted colour of each, and its errors."""
 
     kinds: FloatArray
     wanted: FloatArray
@@ -217,8 +221,8 @@ class GamutStars:
 
 @dataclass(frozen=True, slots=True)
 class ShownStars:
-    """Lone stars (n,) of frames: the colours wanted (n, c), the shares of primaries shown (n, 3),
-    light over the light wanted (n,), and how far places are off (n, 2), px.
+    """Lone stars (n,): wanted colours (n, c), shown shares of primaries (n, 3), light relative to
+    the wanted one (n,), and errors of place (n, 2), px.
     """
 
     wanted: FloatArray
@@ -314,7 +318,7 @@ def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatA
 
 
 def colours_of(file: BenchFile, stars: Stars) -> Colours:
-    """The mixtures of a bench that drives its primaries apart. Raises InputError."""
+    """The mixtures of a bench that drives its primaries separately. Raises InputError."""
     colours = bench_colours(file.config, file.folder, stars.catalog)
     if colours is None:
         raise AssertionError('colour = "star"')
@@ -322,7 +326,7 @@ def colours_of(file: BenchFile, stars: Stars) -> Colours:
 
 
 def gamut_stars(panel: str, sensor: str, folder: Path) -> GamutStars:
-    """The catalogue's stars of a panel before a sensor, without codes."""
+    """The catalogue's stars of a panel before a sensor."""
     file = file_of(folder, panel, sensor)
     stars = bench_stars(file.config, folder)
     colours = colours_of(file, stars)
@@ -399,7 +403,7 @@ def light_by_primary(bench: Bench, levels: Levels) -> FloatArray:
 
 
 def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
-    """The lone stars of so many frames, anywhere on the sky."""
+    """The lone stars of `fields` frames, anywhere on the sky."""
     white = colours.of_white * bench.flux_at_white_e_per_s
     stars = bench.shown_stars
     rng = np.random.default_rng(1)
@@ -439,7 +443,7 @@ def frame_of(bench: Bench, number: int) -> Levels:
 def study_choices(
     folder: Path, trackers: Mapping[str, str], fields: int, rounds: int
 ) -> Iterator[ColourChoice]:
-    """Each choice before trackers by their sensors, on the LCD; frames of all are timed in turn."""
+    """Each choice on the LCD before each tracker; the frames of all choices are timed in turn."""
     for tracker, sensor in trackers.items():
         with ExitStack() as stack:
             benches = {}
@@ -463,7 +467,7 @@ def study_choices(
 def colour_figures(
     stars: ShownStars, colours: Colours, subtypes: Callable[[FloatArray], FloatArray]
 ) -> tuple[float, ...]:
-    """The errors of a choice: subtypes, % of temperature; mag, % of a channel and px, 95 %."""
+    """The errors of a choice: subtypes, % of temperature; mag, % of a channel, px, of 95 %."""
     shown = colours.shown(stars.shares)
     true_subtypes = subtypes(stars.wanted[:, : shown.shape[1]])
     off_subtypes = np.abs(subtypes(shown) - true_subtypes).mean()
@@ -491,7 +495,7 @@ def lens_tracker() -> Tracker:
 def study_lateral(folder: Path) -> Iterator[LateralColour]:
     """Stars of all colours over the field of a lens of 1897, and of a linear one.
 
-    A panel whose primaries its filter does not all pass has no row.
+    A panel has no row where the lens's filter blocks one of its primaries.
     """
     tracker = lens_tracker()
     psf = tracker_psf(tracker, folder)
@@ -541,20 +545,20 @@ def distance_rms_px(places_px: FloatArray) -> float:
 
 
 def linear_px(mean_nm: FloatArray, against: int) -> FloatArray:
-    """By how much a linear lens moves stars of mean wavelengths (n, 1), px, against one of them."""
+    """The shift by a linear lens of stars of mean wavelengths (n, 1), px, against one of them."""
     return np.asarray((mean_nm - mean_nm[against]).T / 100)
 
 
 def moved_px(psf: Psf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
-    """By how much spectra (n, L) move stars at places (2, n), px, against one of them there."""
+    """The shift of spectra (n, L) at places (2, n), px, against one of them at the same places."""
     x_px, y_px = places_px
-    own = np.stack(psf.centroids_px(x_px, y_px, spectra)[:2])
-    others = np.stack(psf.centroids_px(x_px, y_px, spectra[against])[:2])
-    return np.asarray(own - others)
+    moved = np.stack(psf.centroids_px(x_px, y_px, spectra)[:2])
+    reference = np.stack(psf.centroids_px(x_px, y_px, spectra[against])[:2])
+    return np.asarray(moved - reference)
 
 
 def mosaic_image(sigma_px: float, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """Stars at places (PHASES^2,) in tiles of their own, in row-major order, as one image."""
+    """Stars at places (PHASES^2,) within tiles of their own, row by row, as one image."""
     at = np.arange(TILE_PX)
     across = (at - x_px[:, None])[:, None, :]
     down = (at - y_px[:, None])[:, :, None]
@@ -582,7 +586,7 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[MosaicPlaces]:
 
 
 def mosaic_off_px(image: FloatArray, width_px: float, steps: FloatArray) -> FloatArray:
-    """How far stars of an image of tiles are found from where they are, px along x, then y."""
+    """The errors of the places of stars in an image of tiles, px: along x, then along y."""
     settings = CentroidSettings(
         window_sigma_px=max(1.0, width_px), psf_sigma_px=(width_px, width_px), minimum_pixels=2
     )

@@ -27,8 +27,9 @@ FORM = "a folder for each camera: guess.toml, which holds its [tracker], and its
 
 @dataclass(frozen=True, slots=True)
 class PhotographRow:
-    """One image: how far stars to V = 6.5 are off, alone and by a camera that other images
-    fitted; NaN where not measured.
+    """One image: errors of its stars to V = 6.5 in a fit of all images, and when it is held out.
+
+    NaN where not measured.
     """
 
     camera: str
@@ -65,7 +66,7 @@ def run(directory: Path, images: Path, quick: bool = False) -> list[str]:
 
 
 def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographRow]:
-    """The images of one camera, together and each by the others."""
+    """The images of one camera: fitted together, and each held out."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
     if not paths:
         raise InputError(f"{folder}: has no image; give {FORM}")
@@ -119,7 +120,7 @@ def row_of(camera: str, confronted: Confronted, number: int) -> PhotographRow:
 def held_out(
     row: PhotographRow, folder: Path, output: Path, paths: Sequence[Path]
 ) -> PhotographRow:
-    """The row with what a camera of the other images leaves of this one."""
+    """The row with its errors by a camera that the other images fit."""
     own_path = next((path for path in paths if path.name == row.image), None)
     if own_path is None:
         return row
@@ -155,7 +156,7 @@ def line_of(row: PhotographRow) -> str:
 
 
 def short_name(row: PhotographRow, rows: Sequence[PhotographRow]) -> str:
-    """The words of an image's name that not all images of its camera share, whole."""
+    """An image's name without the words that all images of its camera share."""
     parts = Path(row.image).stem.split("_")
     others = []
     for other in rows:

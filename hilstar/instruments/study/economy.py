@@ -46,21 +46,21 @@ COLOURS = {8: ORANGE, 10: BLUE, 12: MUTED}
 
 
 @dataclass(frozen=True, slots=True)
-class Tolerance:
-    """What a star may be off, mag and px, and how the tolerance is called."""
+class EffortTolerance:
+    """The largest allowed error of a star, mag and px, and the tolerance's name."""
 
     name: str
     mag: float
     px: float
 
 
-DEFAULT = Tolerance("default", DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX)
-TOLERANCES = (DEFAULT, Tolerance("0.1", 0.1, 0.1))
+DEFAULT = EffortTolerance("default", DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX)
+TOLERANCES: tuple[EffortTolerance, ...] = (DEFAULT, EffortTolerance("0.1", 0.1, 0.1))
 
 
 @dataclass(frozen=True, slots=True)
 class EffortScene:
-    """Where a bench points, how faint it goes and how fast it turns."""
+    """Where a bench points, how faint its stars go and how fast it turns."""
 
     name: str
     radec_roll_deg: tuple[float, float, float]
@@ -70,11 +70,11 @@ class EffortScene:
 
     @property
     def turn(self) -> CameraTurn:
-        """The attitude, and the turn from it."""
+        """The attitude and its rate."""
         return CameraTurn(from_radec_roll_deg(*self.radec_roll_deg), np.radians(self.rate_deg_s))
 
 
-SCENES = (
+SCENES: tuple[EffortScene, ...] = (
     EffortScene("narrow, sparse", (192.9, 27.1, 0.0), 600.0, 8.0),
     EffortScene("wide, sparse", (192.9, 27.1, 0.0), 120.0, 6.5),
     EffortScene("narrow, Milky Way", (305.0, 40.0, 20.0), 350.0, 8.0),
@@ -85,13 +85,13 @@ SCENES = (
 
 @dataclass(frozen=True, slots=True)
 class EffortOutcome:
-    """A scene at one effort: the times of a frame, the largest errors of stars that stand alone,
-    and the tolerance.
+    """A scene at one effort: the times of a frame, the largest errors of lone stars, and the
+    tolerance.
 
     `tolerance` is "full" at full effort, which has the default's figures. `frame_ms` is the median
-    time of a whole frame, `cpu_ms` that of the processor in it. `claimed_mag` and `claimed_px` are
-    what the plan says of the worst star. `centroid_max_px` is by the plain moment of the light on
-    the monitor, `max_px_...` as each centroider finds stars on the tracker.
+    time of a whole frame, `cpu_ms` its processor time. `claimed_mag` and `claimed_px` are the
+    plan's figures of the worst star. `centroid_max_px` is by the plain moment on the monitor,
+    `max_px_...` by each centroider on the tracker.
     """
 
     scene: str
@@ -123,7 +123,7 @@ class EffortOutcome:
 
     @property
     def share(self) -> float:
-        """The larger of the errors of light and place, in tolerances."""
+        """The larger of the errors of light and place, as a multiple of the tolerance."""
         return max(self.flux_max_mag / self.tolerance_mag, self.worst_px / self.tolerance_px)
 
     @property
@@ -134,7 +134,7 @@ class EffortOutcome:
 
 @dataclass(frozen=True, slots=True)
 class EffortComparison:
-    """A scene at full effort and at the effort that a tolerance needs."""
+    """A scene at full effort, and at the effort that a tolerance needs."""
 
     full: EffortOutcome
     auto: EffortOutcome
@@ -166,7 +166,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
     return load.judged(lines)
 
 
-def effort_keys(tolerance: Tolerance) -> Table:
+def effort_keys(tolerance: EffortTolerance) -> Table:
     """The keys of [render] by which effort keeps a tolerance."""
     return {**AUTO, "tolerance_mag": tolerance.mag, "tolerance_px": tolerance.px}
 
@@ -202,7 +202,7 @@ def frame_of(bench: Bench, turn: CameraTurn, number: int) -> Levels:
 
 
 def outcome(scene: EffortScene, name: str, bench: Bench, times: Sequence[Spent]) -> EffortOutcome:
-    """The errors of a scene's stars at one effort, beside the times of its frames."""
+    """The errors of a scene's stars at one effort, and the times of its frames."""
     tolerances = {tolerance.name: tolerance for tolerance in TOLERANCES}
     tolerance = tolerances.get(name, DEFAULT)
     turn = scene.turn
@@ -336,7 +336,7 @@ def scene_words(comparison: EffortComparison) -> str:
 
 
 def share_of_tolerance(comparison: EffortComparison) -> float:
-    """The error at auto effort, in tolerances."""
+    """The error at auto effort as a multiple of the tolerance."""
     return comparison.auto.share
 
 

@@ -5,12 +5,28 @@ function that measures rows, and specs of charts (x, y, series, scales, note). `
 the table, `draw_rows` a chart. A value of a row is the name of a field, or a function of the row
 where the chart draws something else (a floor, another unit). Rows of two types may share a chart:
 what was measured, and the law that foretells it. A panel has lines and points (`LineSpec`), upright
-bars (`BarSpec`), or some values of each row on a line of its own (`DotsSpec`).
+bars (`BarSpec`), or some values of each row on a line of its own (`DotsSpec`). A study in short:
+
+    >>> @dataclass(frozen=True)
+    ... class Cost:
+    ...     way: str
+    ...     stars: int
+    ...     frame_ms: float
+    >>> rows = [Cost("round", 100, 0.4), Cost("round", 1000, 2.1)]
+    >>> rows += [Cost("exact", 100, 0.9), Cost("exact", 1000, 5.2)]
+    >>> line = LineSpec("stars", "frame_ms")
+    >>> panel = PanelSpec((line,), "time of a frame [ms]", "stars", scales=("log", "log"))
+    >>> looks = looks_of({"round": "rounded codes", "exact": "exact codes"}, "os")
+    >>> spec = ChartSpec((panel,), lambda row: row.way, looks, "Medians.")
+    >>> write_rows(folder / "cost.csv", rows)
+    >>> draw_rows(folder / "cost", "Exact codes take 5.2 ms with 1000 stars", spec, rows)
 
 Methods with an error and a time are `Trials` (trials.py); a method that fails is a `FailureCase`
-(stability) or a `Limit` (limits.py); curves over one x are `CurvePanel`s, with no rows at all.
+(stability) or a `StressLimit` (limits.py); curves over one x are `CurvePanel`s, without rows.
 """
 
+import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -193,7 +209,8 @@ class ChartSpec:
 class CurvePanel:
     """Curves (n,) by their names against one x (n,); `spec` has the labels, scales and ticks.
 
-    `colours` are SERIES's where none are given, `look` the keywords of every line.
+    `colours` are SERIES's and `styles` solid where none are given; `look` has the keywords of every
+    line.
     """
 
     x: FloatArray
@@ -201,6 +218,7 @@ class CurvePanel:
     spec: PanelSpec
     colours: tuple[str, ...] = ()
     look: Mapping[str, Any] = field(default_factory=dict)
+    styles: tuple[str, ...] = ()
 
 
 # Tables
@@ -269,15 +287,17 @@ def draw_rows(
 def row_panels(
     path: Path, finding: str, spec: ChartSpec, rows: Sequence[Any], load: Load = IDLE
 ) -> "Iterator[list[Axes]]":
-    """The panels of a chart of rows, for what a ChartSpec does not have; the chart is written when
-    the context ends.
+    """Draw a chart of rows, and yield its panels for what a ChartSpec cannot say. The chart is
+    written when the context ends.
     """
-    down = len(spec.panels) // spec.columns
+    down = math.ceil(len(spec.panels) / spec.columns)
     note = load.note(spec.note)
     with chart(path, finding, down, spec.columns, note=note, **spec.layout) as grid:
-        for axes, panel in zip(grid, spec.panels, strict=True):
+        for axes, panel in zip(grid, spec.panels, strict=False):
             draw_panel(axes, panel, spec, rows)
-        yield grid
+        for axes in grid[len(spec.panels) :]:
+            axes.set_axis_off()
+        yield grid[: len(spec.panels)]
 
 
 def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[Any]) -> None:
@@ -294,7 +314,7 @@ def draw_panel(axes: "Axes", panel: PanelSpec, spec: ChartSpec, rows: Sequence[A
 
 
 def draw_line(axes: "Axes", line: LineSpec, look: SeriesLook, series: Sequence[Any]) -> None:
-    """Draw what a line has of the rows of one series; nothing where it has none."""
+    """Draw one line of the rows of one series; nothing where no row belongs to it."""
     rows = [row for row in series if isinstance(row, line.of) and holds(line.where, row)]
     if not rows:
         return
@@ -364,7 +384,7 @@ def finish_panel(axes: "Axes", panel: PanelSpec) -> None:
 
 
 def set_scales(axes: "Axes", panel: PanelSpec) -> None:
-    """Set the scales, limits and ticks of a panel; what it does not state stays as it is."""
+    """Set the scales, limits and ticks that a panel states."""
     x_scale, y_scale = panel.scales
     # What a panel draws may have set a scale of its own.
     if x_scale != "linear":
@@ -389,7 +409,7 @@ def set_scales(axes: "Axes", panel: PanelSpec) -> None:
 
 
 def holds(where: Where | None, row: Any) -> bool:
-    """Whether a row is of those that are drawn."""
+    """Whether a row is drawn."""
     return where is None or where(row)
 
 
@@ -406,7 +426,7 @@ def at_least(name: str, floor: float) -> Callable[[Any], float]:
 
 
 def finite(name: str, below: float = np.inf) -> Callable[[Any], float]:
-    """A field, and NaN, which is not drawn, from `below` on."""
+    """A field; NaN, which is not drawn, where it is `below` or more."""
 
     def value(row: Any) -> float:
         size = float(getattr(row, name))
@@ -431,6 +451,7 @@ def draw_curves(path: Path, finding: str, panels: Sequence[CurvePanel], note: st
 def draw_curve_panel(axes: "Axes", panel: CurvePanel) -> None:
     """Draw the curves of one panel."""
     colours = panel.colours or SERIES
-    for (name, values_y), colour in zip(panel.curves.items(), colours, strict=False):
-        axes.plot(panel.x, values_y, color=colour, label=name, **panel.look)
+    styles = panel.styles or itertools.repeat("-")
+    for (name, values_y), colour, style in zip(panel.curves.items(), colours, styles, strict=False):
+        axes.plot(panel.x, values_y, ls=style, color=colour, label=name, **panel.look)
     finish_panel(axes, panel.spec)

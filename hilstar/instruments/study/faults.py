@@ -121,9 +121,7 @@ CASES: dict[str, list[dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class FaultCost:
-    """One case: median times of a frame, ms, with the fault and without any, in turn in the same
-    run.
-    """
+    """One case: the median time of a frame with and without the fault, ms, in turn in one run."""
 
     quantisation: str
     case: str
@@ -134,8 +132,9 @@ class FaultCost:
 
 @dataclass(frozen=True, slots=True)
 class Stray:
-    """Stars over even stray light of a share of white: the error of their light in the codes,
-    and the share that is lost.
+    """Stars over even stray light: the errors of their light in the codes, mag, and the share lost.
+
+    The stray light is a share of white.
     """
 
     quantisation: str
@@ -164,7 +163,7 @@ def attitude_of(frame: int) -> FloatArray:
     return propagate(FIELD, SLEW_RAD_S, frame / REFRESH_HZ)
 
 
-class FaultyFrames:
+class CaseFrames:
     """The frames of a bench under the faults of a case, and the same frames without any."""
 
     def __init__(self, bench: Bench, folder: Path, case: str) -> None:
@@ -202,7 +201,7 @@ class FaultyFrames:
 
 def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     """The time of a frame with the faults of a case and without any, in turn."""
-    frames = FaultyFrames(bench, folder, case)
+    frames = CaseFrames(bench, folder, case)
     ms = medians_ms({"without": frames.without, "with": frames.with_faults}, rounds)
     quantisation = bench.config.render.quantisation
     cost_ms = ms["with"] - ms["without"]
@@ -210,9 +209,7 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
 
 
 def stray_light(bench: Bench, share: float) -> Stray:
-    """Each star's light in the codes over even stray light: the frame with the stars, less the
-    same without them.
-    """
+    """The errors of stars over even stray light, by frames with them and without them."""
     sprites = bench.light(bench.view(FIELD))
     lights: tuple[GlowLight, ...] = ()
     if share:
@@ -238,7 +235,7 @@ def stray_light(bench: Bench, share: float) -> Stray:
 
 
 def light_of(bench: Bench, sprites: FrameLight) -> FloatArray:
-    """The light (h, w) that a frame of sprites makes the panel show."""
+    """The light (h, w) of the panel when it shows a frame of sprites."""
     return shown_light(bench.draw_sprites(sprites).levels, bench.panel).copy()
 
 
@@ -268,7 +265,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def cost_line(costs: Sequence[FaultCost], quantisation: str) -> str:
-    """What nothing, a false star and the dearest fault take, in words."""
+    """The cost of a scenario without faults, of a false star and of the dearest fault, in words."""
     by_case = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
     nothing = by_case[NOWHERE]
     star = by_case["false star, on the sky"]
@@ -281,7 +278,7 @@ def cost_line(costs: Sequence[FaultCost], quantisation: str) -> str:
 
 
 def stray_line(strays: Sequence[Stray], quantisation: str) -> str:
-    """From which stray light on stars are spoilt, in words."""
+    """The stray light that spoils stars, in words."""
     share = spoilt_from(strays, quantisation)
     limit = "no stray light here"
     if share is not None:
@@ -293,8 +290,8 @@ def stray_line(strays: Sequence[Stray], quantisation: str) -> str:
 
 
 def spoilt_from(strays: Sequence[Stray], quantisation: str) -> float | None:
-    """The stray light, share of white, above which stars are off by more than SPOILT_MAG; None
-    where none spoils them.
+    """The smallest stray light, share of white, at which 95 % of the stars are not within
+    SPOILT_MAG; None where none is that large.
     """
     shares = []
     for stray in strays:

@@ -51,7 +51,7 @@ DESIGN_FOCAL_MM = 100.0
 SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
 NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 USUAL_SIZE, USUAL_NOISE_PX = (20, 60), 0.02
-STARS = 4000
+STARS = 4000  # chance moves an rms over so many by about 1 %
 FAIL_ARCSEC = 1.0
 SEED = 7
 MARKERS = "osd^"
@@ -69,8 +69,8 @@ TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3
 
 @dataclass(frozen=True, slots=True)
 class DotFaults:
-    """The noise of a centroid (one sigma, one axis), and the shares of lit dots that are lost
-    and false.
+    """The noise of a centroid, px (one sigma, one axis), and the shares of lit dots that are lost
+    and that are false.
     """
 
     noise_px: float = 0.02
@@ -125,7 +125,7 @@ def turned(a_deg: float, b_deg: float, c_deg: float = 0.0) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class TracedBench:
-    """A doublet, tilted and decentred, before a tilted screen: angles in degrees, lengths in mm."""
+    """A tilted, decentred doublet before a tilted screen; angles in degrees, lengths in mm."""
 
     resolution_px: tuple[int, int] = (1920, 1080)
     pitch_mm: float = 0.05765
@@ -137,7 +137,7 @@ class TracedBench:
     screen_shift_mm: tuple[float, float] = (0.5, 0.3)
 
     def places_px(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where on the screen, px, the rays of directions (n, 3) in cam end, (n,) each."""
+        """Where the rays of directions (n, 3) in cam meet the screen, px: x and y (n,)."""
         at, ray = self.behind_lens(directions)
         screen = turned(*self.screen_tilt_deg)
         scale = self.focal_mm / DESIGN_FOCAL_MM
@@ -167,9 +167,7 @@ class TracedBench:
         return from_vertex @ axes.T + vertex, ray @ axes.T
 
     def directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """The directions (n, 3) in cam of pixels (n,): the inverse, by Newton's method with
-        differences.
-        """
+        """The directions (n, 3) in cam of pixels (n,), by Newton's method with differences."""
         width, height = self.resolution_px
         u = (np.asarray(x_px) - (width - 1) / 2) * self.pitch_mm / self.focal_mm
         v = (np.asarray(y_px) - (height - 1) / 2) * self.pitch_mm / self.focal_mm
@@ -193,15 +191,15 @@ class TracedBench:
 
 
 def along_axis(mm: float) -> FloatArray:
-    """A way along a lens's axis, mm."""
+    """A vector along the lens's axis, mm."""
     return np.array([0.0, 0.0, mm])
 
 
 def _refracted(
     at: FloatArray, ray: FloatArray, radius: float, ratio: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Points on, and directions behind, a sphere whose vertex is at the origin; `ratio` is n
-    before over n after.
+    """Points on a sphere whose vertex is the origin, and directions behind it. `ratio` is n before
+    over n after.
     """
     centre = along_axis(radius)
     to_centre = at - centre
@@ -239,7 +237,7 @@ class Frames:
     noise_px: float
 
 
-MODELS = (
+MODELS: tuple[LensModel, ...] = (
     LensModel("a pinhole", PINHOLE),
     LensModel("a pinhole with k1", RADIAL),
     LensModel("Brown-Conrady with tilt", BROWN_CONRADY),
@@ -249,7 +247,7 @@ MODELS = (
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOutcome:
-    """One model on one set of frames: the error of held-out dots, and that of stars all over the
+    """One lens model fitted to one set of frames: its errors at held-out dots and at stars over the
     screen.
     """
 
@@ -308,7 +306,7 @@ def line_of(outcome: CalibrationOutcome) -> str:
 
 
 def ideal_arcsec() -> float:
-    """How far stars are off with no calibration at all, rms over the screen."""
+    """The error of stars without any calibration, arcsec rms over the screen."""
     nominal = _nominal()
     still = Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])
     return float(np.sqrt(np.square(_star_errors(still)).mean()))
@@ -346,7 +344,7 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
 
 
 def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """How far stars all over the screen are shown from where the traced rays put them, arcsec."""
+    """The distances between shown stars and their traced places, arcsec (STARS,)."""
     rng = np.random.default_rng(SEED)
     width, height = BENCH.resolution_px
     x = rng.uniform(-0.5, width - 0.5, STARS)
@@ -388,12 +386,12 @@ def draw(
 
 
 def error_panel(x: str, where: Where) -> PanelSpec:
-    """The errors of every model against one thing that is varied."""
+    """The errors of every model against one varied quantity."""
     return PanelSpec(lines_of(x, where), "error, rms [arcsec]", scales=("log", "log"))
 
 
 def lines_of(x: str, where: Where) -> tuple[LineSpec, ...]:
-    """The errors of stars, and dotted those of dots that were held out, against `x`."""
+    """The errors of stars against `x`, and dotted those of held-out dots."""
     stars = LineSpec(x, "stars_rms_arcsec", where=where)
     dotted = {"lw": HELD_OUT_WIDTH}
     held_out_dots = LineSpec(
@@ -403,10 +401,10 @@ def lines_of(x: str, where: Where) -> tuple[LineSpec, ...]:
 
 
 def has_usual_noise(outcome: CalibrationOutcome) -> bool:
-    """Whether only the dots of an outcome's frames are varied."""
+    """Whether an outcome varies only the dots of its frames."""
     return outcome.noise_px == USUAL_NOISE_PX
 
 
 def has_usual_size(outcome: CalibrationOutcome) -> bool:
-    """Whether only the noise of an outcome's centroids is varied."""
+    """Whether an outcome varies only the noise of its centroids."""
     return (outcome.frames, outcome.dots_per_frame) == USUAL_SIZE

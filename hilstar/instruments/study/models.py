@@ -137,11 +137,12 @@ DARK_LAWS: dict[str, dict[str, Any]] = {
 COLD_K = 273.0
 BODIES_K = (3000.0, 5000.0, 9000.0, 30_000.0)
 BAND_COLOURS = (PURPLE, BLUE, GREEN, ORANGE, INK)
-CORNERS_HZ = (0.0, 1e4, 1e5)
+CORNERS_HZ = (0.0, 1e4, 1e5)  # of 1/f noise
 ZODIACAL_V_MAG, ZODIACAL_NM = 22.1, (330.0, 1100.0)
-BRIGHT_V_MAG = 7.5
+BRIGHT_V_MAG = 7.5  # to which Hipparcos is complete
 HELD_OUT = "pickles, leave-one-out"
 BY_TYPE = "mk, leave-one-out"
+BODY = "black body, ballesteros2012"
 ZERO_POINTS: tuple[ZeroPoint, ...] = ("vega", "iau-bolometric")
 SETTINGS = [Photometry(*setting) for setting in product(ZERO_POINTS, WEIGHTINGS)]
 # where Torres 2010 holds; exact at 0, where wang2021 steps
@@ -150,10 +151,12 @@ BV_MAG = np.arange(-30, 201) / 100
 PERCENTILE_COLUMNS = ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
 # By the order in which methods are drawn, the last first.
 SPECTRUM_MARKS = (("+", GREEN), ("x", ORANGE), ("^", INK), ("o", BLUE))
-SCALE_STYLES = ((":", MUTED), ("-", BLUE), ("-", ORANGE))
+SUPERGIANTS = "torres2010_supergiant"
+SCALE_STYLES, SCALE_COLOURS = (":", "-", "-"), (MUTED, BLUE, ORANGE)
+ZERO_LINE = LevelLine(0, HIDDEN, style="-", width=1)
 BAR = {"width": 0.38}
 WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
-MIN_STARS = 20
+MIN_STARS = 20  # 5 % of fewer is no star
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +171,7 @@ class CatalogueFigure:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredValue:
-    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are
-    drawn.
-    """
+    """A figure of the catalogue's stars (n,), its axis's label, and the drawn limits."""
 
     of_star: FloatArray
     label: str
@@ -251,7 +252,7 @@ def draw_catalogue_errors(
 
 
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
-    """The figure that each error of table 2.3 belongs to, by the error's name."""
+    """The catalogue's figure behind each error of table 2.3, by the error's name."""
     pm_ra = catalog.pm_ra_cosdec_mas_yr
     pm_dec = catalog.pm_dec_mas_yr
     return {
@@ -265,14 +266,14 @@ def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
 
 
 def density() -> "Colormap":
-    """From clear to blue, on light pages and on dark ones."""
+    """A colour map from clear to blue, for light and dark pages."""
     from matplotlib.colors import LinearSegmentedColormap, to_rgba
 
     return LinearSegmentedColormap.from_list("density", [to_rgba(BLUE, 0.06), to_rgba(BLUE, 1.0)])
 
 
 def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) -> None:
-    """The median of an error over the sky, which Hipparcos scanned about the ecliptic's poles."""
+    """A map of the median of an error; Hipparcos scanned the sky about the ecliptic's poles."""
     ra_edges = np.linspace(0, 360, 73)
     dec_edges = np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
     column = np.digitize(catalog.ra_deg, ra_edges) - 1
@@ -510,20 +511,20 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
 
 @dataclass(frozen=True, slots=True)
 class SpectrumErrors:
-    """The error of the electron rate of a sensor by one method, %, of all library stars (n,)."""
+    """The errors (n,) of the electron rates of library stars by one method and sensor, %."""
 
     sensor: str
     method: str
     percent: FloatArray
 
     def within(self, stars: BoolArray) -> tuple[float, float]:
-        """What half of some stars are within, and 95 % of them, %."""
+        """The errors that half and 95 % of some stars are within, %."""
         half, at_95 = np.percentile(np.abs(self.percent[stars]), (50, 95)).tolist()
         return half, at_95
 
 
 def spectrum_errors() -> list[SpectrumErrors]:
-    """Each sensor by each method: spectra held out in turn, and black bodies."""
+    """Every sensor by every method: held-out spectra, and black bodies."""
     library = load_library()
     photometry = Photometry()
     rows = []
@@ -552,25 +553,14 @@ def spectra(directory: Path) -> ChartFinding:
     late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
     usual = []
     late_giants = []
-    worst_real = 0.0
-    worst_body = 0.0
     for sensor, title in SENSORS.items():
         name = title.split()[0]
-        real, real_95 = by_method[sensor, HELD_OUT].within(sure)
-        body, body_95 = by_method[sensor, "black body, ballesteros2012"].within(sure)
-        worst_real = max(worst_real, real_95)
-        worst_body = max(worst_body, body_95)
-        usual.append(
-            f"{name} {real:.1f} % ({real_95:.1f} %) by real spectra and V-I, {body:.1f} %"
-            f" ({body_95:.1f} %) by black bodies and B-V"
-        )
-        _, late_real = by_method[sensor, HELD_OUT].within(late)
-        _, late_type = by_method[sensor, BY_TYPE].within(late)
-        _, others_type = by_method[sensor, BY_TYPE].within(sure)
-        late_giants.append(
-            f"{name} {late_real:.0f} % by V-I, {late_type:.1f} % by MK type (others"
-            f" {others_type:.1f} %)"
-        )
+        real = by_method[sensor, HELD_OUT]
+        by_type = by_method[sensor, BY_TYPE]
+        usual.append(f"{name} {spectra_words(real, by_method[sensor, BODY], sure)}")
+        late_giants.append(f"{name} {late_words(real, by_type, late, sure)}")
+    worst_real = max(by_method[sensor, HELD_OUT].within(sure)[1] for sensor in SENSORS)
+    worst_body = max(by_method[sensor, BODY].within(sure)[1] for sensor in SENSORS)
     text = (
         f"Median error of the electron rate (95 %), V-I < 2.5: {'; '.join(usual)}; late M giants"
         f" (95 %), {'; '.join(late_giants)}"
@@ -594,6 +584,26 @@ def spectra(directory: Path) -> ChartFinding:
     table = zip(library.spectral_type, library.bv_mag, library.vi_mag, *errors, strict=True)
     write_csv(directory / "spectra.csv", columns, table)
     return ChartFinding("spectra", text)
+
+
+def spectra_words(real: SpectrumErrors, body: SpectrumErrors, sure: BoolArray) -> str:
+    """The errors of real spectra and of black bodies, in words."""
+    real_half, real_95 = real.within(sure)
+    body_half, body_95 = body.within(sure)
+    return (
+        f"{real_half:.1f} % ({real_95:.1f} %) by real spectra and V-I, {body_half:.1f} %"
+        f" ({body_95:.1f} %) by black bodies and B-V"
+    )
+
+
+def late_words(
+    real: SpectrumErrors, by_type: SpectrumErrors, late: BoolArray, sure: BoolArray
+) -> str:
+    """The errors of late M giants by colour and by type, and of the others by type, in words."""
+    by_colour_95 = real.within(late)[1]
+    by_type_95 = by_type.within(late)[1]
+    others_95 = by_type.within(sure)[1]
+    return f"{by_colour_95:.0f} % by V-I, {by_type_95:.1f} % by MK type (others {others_95:.1f} %)"
 
 
 def draw_spectra(axes: "Axes", sensor: str, rows: Sequence[SpectrumErrors]) -> None:
@@ -692,34 +702,36 @@ def setting_words(row: ZeroPointRow) -> str:
 
 def names_with(figures: Mapping[str, tuple[float, float]], form: str) -> str:
     """Names with their two figures, as `form` writes them, in one line."""
-    words = []
+    named = []
     for name, (half, most) in figures.items():
-        words.append(form.format(name=name.split()[-1], half=half, most=most))
-    return ", ".join(words)
+        named.append(form.format(name=name.split()[-1], half=half, most=most))
+    return ", ".join(named)
+
+
+def within_mag(bv: FloatArray, mag: FloatArray) -> tuple[float, float]:
+    """What half and 95 % of Hipparcos to V = 7.5 are within, mag, by errors (n,) over B-V (n,)."""
+    stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
+    stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
+    off_mag = np.abs(np.interp(stars_bv, bv, mag))
+    half, most = np.percentile(off_mag, (50, 95)).tolist()
+    return half, most
 
 
 def temperature_scales(directory: Path) -> ChartFinding:
     """The scales that a bench file can choose, beside Torres 2010, and their error in electrons."""
     bv = np.union1d(SCALE_BV_MAG, -1e-9)  # both sides of wang2021's step
     torres = torres2010_k(bv)
-    optics = study_optics("ccd47-20")
-    photometry = Photometry()
-    base = dgs_electrons_per_s(torres, optics, photometry)
-    kelvin = {"torres2010_supergiant": torres2010_k(bv, supergiant=True)}
+    kelvin = {SUPERGIANTS: torres2010_k(bv, supergiant=True)}
     for name, scale in TEMPERATURE_SCALES.items():
         kelvin[name] = scale(bv)
+    optics = study_optics("ccd47-20")
+    base = dgs_electrons_per_s(torres, optics, Photometry())
     percent = {}
     mag = {}
     for name, scale_k in kelvin.items():
         percent[name] = 100 * (scale_k / torres - 1)
-        mag[name] = magnitude(dgs_electrons_per_s(scale_k, optics, photometry) / base)
-    stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
-    stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
-    within = {}
-    for name in TEMPERATURE_SCALES:
-        off_mag = np.abs(np.interp(stars_bv, bv, mag[name]))
-        half, most = np.percentile(off_mag, (50, 95)).tolist()
-        within[name] = half, most
+        mag[name] = magnitude(dgs_electrons_per_s(scale_k, optics, Photometry()) / base)
+    within = {name: within_mag(bv, mag[name]) for name in TEMPERATURE_SCALES}
     zero = int(np.searchsorted(bv, 0.0))
     before_step_k = kelvin["wang2021"][zero - 1]
     step_k = before_step_k - kelvin["wang2021"][zero]
@@ -736,29 +748,34 @@ def temperature_scales(directory: Path) -> ChartFinding:
         "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, +"
         " is fainter."
     )
-    with chart(directory / "temperature_scales", finding, panels=3, note=note) as panels:
-        above, middle, below = panels
-        above.plot(bv, torres, color=INK, label="Torres 2010")
-        for name, (style, colour) in zip(kelvin, SCALE_STYLES, strict=True):
-            label = name.replace("torres2010_supergiant", "Torres, supergiants")
-            mag_label = label
-            if name in within:
-                mag_label = f"{name}: half within {within[name][0]:.3f}"
-            above.plot(bv, kelvin[name], style, color=colour, label=label)
-            middle.plot(bv, percent[name], style, color=colour, label=label)
-            below.plot(bv, mag[name], style, color=colour, label=mag_label)
-        for axes in (middle, below):
-            axes.axhline(0, color=INK, lw=1)
-        above.set(yscale="log", ylabel="temperature [K]")
-        middle.set(ylabel="difference [%]")
-        below.set(xlabel="B-V [mag]", ylabel="difference in electrons [mag]")
-        label_ends(*panels)
+    above = PanelSpec(ylabel="temperature [K]", scales=("linear", "log"))
+    middle = PanelSpec(ylabel="difference [%]", levels=(ZERO_LINE,))
+    below = PanelSpec(
+        ylabel="difference in electrons [mag]", xlabel="B-V [mag]", levels=(ZERO_LINE,)
+    )
+    labels = {name: name.replace(SUPERGIANTS, "Torres, supergiants") for name in kelvin}
+    mag_labels = dict(labels)
+    for name, (half, _) in within.items():
+        mag_labels[name] = f"{name}: half within {half:.3f}"
+    scales = {"Torres 2010": torres, **relabelled(kelvin, labels)}
+    panels = (
+        CurvePanel(bv, scales, above, (INK, *SCALE_COLOURS), styles=("-", *SCALE_STYLES)),
+        CurvePanel(bv, relabelled(percent, labels), middle, SCALE_COLOURS, styles=SCALE_STYLES),
+        CurvePanel(bv, relabelled(mag, mag_labels), below, SCALE_COLOURS, styles=SCALE_STYLES),
+    )
+    draw_curves(directory / "temperature_scales", finding, panels, note)
     columns = {"bv_mag": bv, "torres2010_k": torres}
     for unit, values in (("k", kelvin), ("percent", percent), ("mag", mag)):
-        for name, column in values.items():
-            columns[f"{name}_{unit}"] = column
+        columns |= relabelled(values, {name: f"{name}_{unit}" for name in values})
     write_columns(directory / "temperature_scales.csv", columns)
     return ChartFinding("temperature_scales", text)
+
+
+def relabelled(
+    curves: Mapping[str, FloatArray], labels: Mapping[str, str]
+) -> dict[str, FloatArray]:
+    """Curves by their labels."""
+    return {labels[name]: values for name, values in curves.items()}
 
 
 def choices(directory: Path) -> ChartFinding:
@@ -803,13 +820,13 @@ def choices(directory: Path) -> ChartFinding:
 
 
 def cost_label(name: str, paid: Mapping[str, tuple[float, float]]) -> str:
-    """A choice with what half of the stars pay for it, and a twentieth."""
+    """A choice, what half of the stars pay for it, and what a twentieth pays."""
     half, most = paid[name]
     return f"{name.rsplit(maxsplit=1)[-1]}: {half:.2f} ({most:.2f})"
 
 
 def star_costs_mag(stars: Catalog, optics: Optics) -> dict[str, FloatArray]:
-    """The cost of each choice for stars (n,), mag; real spectra among them."""
+    """The cost of each choice for stars (n,), mag, that of real spectra included."""
     table = tabulate_pickles(optics, Photometry())
     real = table.electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
     # a spectrum for each colour, of which there are few
@@ -824,7 +841,7 @@ def star_costs_mag(stars: Catalog, optics: Optics) -> dict[str, FloatArray]:
 
 
 def choices_finding(paid: Mapping[str, tuple[float, float]]) -> str:
-    """Which choice changes half of the stars most, and which a twentieth; mag (2,) by choice."""
+    """The choice that changes half of the stars most, and the one that changes a twentieth most."""
     dearest = max(paid, key=lambda name: paid[name][0])
     for_few = max(paid, key=lambda name: paid[name][1])
     half, most = paid[dearest]

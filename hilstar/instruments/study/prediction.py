@@ -60,8 +60,8 @@ RATES_HZ = (5, 10, 20, 50, 100, 200)
 LATENCIES_MS = (2, 5, 10, 20, 50, 100)
 USUAL_HZ, USUAL_MS = 100, 20
 FRAME_HZ = 60
-SPAN_S, QUICK_SPAN_S = 40.0, 4.0
-TIMED = 200
+SPAN_S, QUICK_SPAN_S = 40.0, 4.0  # of the slew: two of its swings, or part of one
+TIMED = 200  # attitudes, whose median time counts
 MARKERS = "osd^vx"
 
 Way = Literal["rate", "auto", "newest"]
@@ -85,8 +85,8 @@ Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class PredictionOutcome:
-    """One predictor at one rate and latency: errors over all frames, arcsec, and the time of one
-    attitude, us.
+    """One predictor at one packet rate and latency: errors over all frames, arcsec, and the time of
+    one attitude, us.
     """
 
     method: str
@@ -99,8 +99,8 @@ class PredictionOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Shaken:
-    """A vibration by one way of prediction: the amplitude shown and the error (rms), as shares
-    of the true ones.
+    """A vibration with one way of prediction: the shown amplitude and the rms error, relative to
+    the true ones.
     """
 
     way: str
@@ -131,7 +131,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
 
 
 def is_usual(packet_hz: int, age_ms: int) -> bool:
-    """Whether packets are as most benches have them."""
+    """Whether packet rate and age are those of most benches."""
     return (packet_hz, age_ms) == (USUAL_HZ, USUAL_MS)
 
 
@@ -150,7 +150,7 @@ def slew_outcomes(span_s: float) -> list[PredictionOutcome]:
 
 
 def slew_finding(usual: Sequence[PredictionOutcome]) -> str:
-    """What the default predictor leaves, beside none."""
+    """The error of the default predictor, beside that of none."""
     rms_arcsec = {row.method: row.rms_arcsec for row in usual}
     default = next(predictor.name for predictor in predictors() if predictor.is_default)
     return (
@@ -185,7 +185,7 @@ def shaken_rows(quick: bool) -> list[Shaken]:
 
 
 def shaken_finding(rows: Sequence[Shaken]) -> str:
-    """From which frequency on no prediction is better, and what "auto" leaves."""
+    """The frequency above which no prediction is better, and the error of "auto"."""
     given, derived = (crossing_hz(rows, packets, USUAL_HZ, USUAL_MS) for packets in SENDERS)
     return (
         f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
@@ -197,10 +197,10 @@ def shaken_finding(rows: Sequence[Shaken]) -> str:
 def shaken_error(
     way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool
 ) -> tuple[float, float]:
-    """Error (rms) and amplitude of a vibration about z, beside a steady turn, as shown: shares of
-    the vibration's own.
+    """The rms error and the shown amplitude of a vibration about z beside a steady turn, relative
+    to the true ones.
 
-    "newest" stands still between packets; the steady turn is known to it.
+    "newest" holds the attitude between packets; it knows the steady turn.
     """
     turn = SHAKEN_TURN_RAD_S
     ahead_ns = NS_PER_S
@@ -255,7 +255,7 @@ def auto_times(rows: Sequence[Shaken]) -> float:
 
 def crossing_hz(rows: Sequence[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
     """The frequency above which the newest attitude is nearer than one predicted by its rate;
-    infinite for none.
+    infinite where there is none.
     """
     residuals: dict[str, dict[float, float]] = {"rate": {}, "newest": {}, "auto": {}}
     for row in rows:
@@ -330,12 +330,12 @@ def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load
 
 
 def has_usual_rate(row: PredictionOutcome) -> bool:
-    """Whether latency alone is varied."""
+    """Whether a row varies latency only."""
     return row.rate_hz == USUAL_HZ
 
 
 def has_usual_latency(row: PredictionOutcome) -> bool:
-    """Whether the rate of packets alone is varied."""
+    """Whether a row varies the packet rate only."""
     return row.latency_ms == USUAL_MS
 
 

@@ -57,7 +57,7 @@ EACH_LOOKS = SeriesLook("round", ORANGE), SeriesLook("exact", BLUE)
 
 @dataclass(frozen=True, slots=True)
 class WayErrors:
-    """The errors of one way, of stars so many magnitudes under white."""
+    """The errors of one way at one magnitude under white."""
 
     bits: int
     method: str
@@ -176,14 +176,15 @@ def centroider_errors(rows: Sequence[WayErrors]) -> list[CentroiderErrors]:
 def summary(bits: int, rows: Sequence[WayErrors]) -> str:
     """The largest errors of every way on a panel of these bits, beside its aim."""
     aim_mag, limit = codes.AIMS[bits]
-    words = [largest_words(rows, bits, way.name) for way in codes.WAYS]
-    named = [f"{way.method} {largest}" for way, largest in zip(codes.WAYS, words, strict=True)]
-    others = ", ".join(named[:3])
+    largest = {way.name: largest_words(rows, bits, way.name) for way in codes.WAYS}
+    others = ", ".join(f"{way.method} {largest[way.name]}" for way in codes.WAYS[:3])
+    exact = largest["exact"]
+    stealing = largest["exact" + codes.STEALING]
     half_step_px = srgb_response(bits).half_step * USUAL_PSF.peak_share / flux_ratio(limit)
     aim = f"aim {aim_mag:g} mag, {codes.AIM_PX:g} px"
     return (
         f"{bits} bits, sRGB, {limit:g} magnitudes ({aim}): largest errors, places by a PSF fit, of"
-        f" exact {words[3]}, with bit stealing {words[5]}; {others} (over {EXPOSURE_FRAMES}"
+        f" exact {exact}, with bit stealing {stealing}; {others} (over {EXPOSURE_FRAMES}"
         " frames). Half the smallest step of light moves a centroid by"
         f" {half_step_px:.3f} px along each axis"
     )
@@ -202,7 +203,7 @@ def largest_words(rows: Sequence[WayErrors], bits: int, method: str) -> str:
 
 
 def centroiders_line(rows: Sequence[CentroiderErrors]) -> str:
-    """What `exact` leaves of the error of `round` on the coarsest panel, by centroider."""
+    """The error of `exact` relative to `round` on the coarsest panel, by centroider."""
     coarsest = codes.BITS[0]
     ratios = []
     for row in rows:
@@ -276,7 +277,7 @@ def magnitude_lines(bits: int, error: str) -> tuple[LineSpec, ...]:
 
 
 def as_drawn(error: str) -> Callable[[WayErrors], float]:
-    """An error on a logarithmic axis: at least MIN_ERROR, NaN where a star shows nothing."""
+    """An error for a logarithmic axis: at least MIN_ERROR, NaN where a star shows nothing."""
 
     def value(row: WayErrors) -> float:
         size = float(getattr(row.figures, error))

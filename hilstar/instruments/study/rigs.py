@@ -71,7 +71,7 @@ READ_NOISE_E = FULL_WELL_E / 30 / math.sqrt(12)
 # star_detection_centroiding.py: a dark frame's mean; main_detection_centroiding.py: 3 DN over the
 # background, areas over 3 px, and 7 x 7 px for the centre of mass.
 DARK_DN, THRESHOLD_DN, MIN_PIXELS, MASS_HALF_PX = 10.0, 3.0, 4, 3
-GRID_HALF_PX, FIT_HALF_PX = 2, 4
+GRID_HALF_PX, FIT_HALF_PX = 2, 4  # half sides of the squares of pixels that they use
 EDGE_PX, MATCHED_PX = 5, 3.0
 # Sigma over five minutes about the boresight and two axes across it, arcsec, STATIC.
 SCATTER_ARCSEC = {
@@ -81,12 +81,12 @@ SCATTER_ARCSEC = {
 }
 FITTED, LIGHT_UNIT = "Gaussian grid", "DN"
 LIGHTS_DN = (34.0, 40.0, 48.0, 60.0, 80.0)
-EXPOSURES, QUICK_EXPOSURES = 300, 40
+EXPOSURES, QUICK_EXPOSURES = 300, 40  # chance moves a sigma of so many by 4 and 11 %
 # Naples: a panel of 0.641 m of 2560 pixels before 1.3 m (REPOSITORY, old_error_analysis.py); 16
 # stars a solution, 22.48 x 17.02 degrees, 5 and 30 arcsec (NAPLES_SOURCE).
 NAPLES_PIXEL_ARCSEC = 641.0 / 2560 / 1300.0 * ARCSEC_PER_RAD
 NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_ARCSEC = 16, (22.48, 17.02), (30.0, 5.0)
-TRIALS = 2000
+TRIALS = 2000  # chance moves an rms of so many by 1.6 %
 P13_RESOLUTION_ARCSEC, P13_ARCSEC = 3.43, 2.0
 OUTSIDE_PIXEL_ARCSEC, OUTSIDE_CODES_ARCSEC, OUTSIDE_CODES_MAG = 10.30, 0.082, 0.0054
 PLACE_UNIT = "arcsec rms an axis"
@@ -151,7 +151,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 
 def attitudes(count: int) -> list[FloatArray]:
-    """Attitudes by chance, evenly over the sky: `count` quaternions q_icrs_to_cam."""
+    """Random attitudes, evenly over the sky: `count` quaternions q_icrs_to_cam."""
     rng = np.random.default_rng(SEED)
     ra_deg = rng.uniform(0.0, 360.0, count)
     dec_deg = np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, count)))
@@ -161,7 +161,7 @@ def attitudes(count: int) -> list[FloatArray]:
 
 
 def place_rows(count: int) -> list[RigFigure]:
-    """What each way leaves of places and light on the panel, over attitudes."""
+    """The errors of places and light on the panel, by one pixel a star and by hilstar's codes."""
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024), "transmission": GLASS},
         "sky": {"faintest_v_mag": FAINTEST_V_MAG},
@@ -211,7 +211,7 @@ def place_rows(count: int) -> list[RigFigure]:
 
 
 def pixel_errors(bench: Bench, turn: CameraTurn) -> FloatArray:
-    """How far the middle of the pixel that a star falls into is off (2, n), px, of a field."""
+    """The distances (2, n), px, from a field's stars to the middles of their pixels."""
     sprites = turning_sprites(bench, turn)
     places = np.stack([sprites.x_px, sprites.y_px])
     size_px = np.array(bench.camera.resolution_px)[:, None]
@@ -260,7 +260,7 @@ def rig_field() -> RigField:
 
 
 def centre_of_mass(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
-    """The first moment of the pixels about a star, its background in it, as the rig's."""
+    """The first moment of the pixels around a star, background included, as the rig's."""
     at = np.arange(-MASS_HALF_PX, MASS_HALF_PX + 1)
     stamps = stamps_at(image, columns, rows, MASS_HALF_PX)
     light = stamps.sum(axis=(1, 2))
@@ -270,7 +270,7 @@ def centre_of_mass(image: FloatArray, columns: IntArray, rows: IntArray) -> Plac
 
 
 def gaussian_grid(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
-    """Parabolas through logarithms of the pixels of each line, weighted by the pixels, whose
+    """Parabolas through the logarithms of each line's pixels, weighted by the pixels; their
     coefficients are summed over the lines (Delabie et al. 2014, J. Astronaut. Sci. 61, 60).
     """
     stamps = np.maximum(stamps_at(image, columns, rows, GRID_HALF_PX), 1.0)
@@ -278,9 +278,9 @@ def gaussian_grid(image: FloatArray, columns: IntArray, rows: IntArray) -> Place
 
 
 def _vertex(lines: FloatArray) -> FloatArray:
-    """Where the parabolas (n, lines, pixels) together have their top, px from the middle.
+    """The common top of the parabolas (n, lines, pixels), px from the middle.
 
-    Each line's coefficients are multiplied by its normal equations' determinant.
+    Each line's coefficients are multiplied by the determinant of its normal equations.
     """
     half = lines.shape[2] // 2
     powers = np.arange(-half, half + 1) ** np.arange(3)[:, None]
@@ -296,7 +296,7 @@ def _vertex(lines: FloatArray) -> FloatArray:
 
 
 def psf_fit(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
-    """Least squares of the PSF, the level known: no centroider scatters less by much."""
+    """A least-squares fit of the PSF with a known background: no centroider scatters much less."""
     stamps = stamps_at(image, columns, rows, FIT_HALF_PX) - DARK_DN
     x_px, y_px = star_places(stamps, "fit", (PSF_SIGMA_PX, PSF_SIGMA_PX))
     return columns + x_px, rows + y_px
@@ -318,7 +318,7 @@ def stamps_at(image: FloatArray, columns: IntArray, rows: IntArray, half: int) -
 
 
 def found_stars(image: FloatArray) -> tuple[IntArray, IntArray]:
-    """Columns and rows (n,) of the rig's detection: middles of lit areas, rounded down."""
+    """Columns and rows (n,) by the rig's detection: the middles of lit areas, rounded down."""
     labels, count = ndimage.label(image > DARK_DN + THRESHOLD_DN)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     wide = np.flatnonzero(sizes >= MIN_PIXELS)
@@ -334,8 +334,9 @@ def found_stars(image: FloatArray) -> tuple[IntArray, IntArray]:
 def scatter_arcsec(
     field: RigField, places_px: FloatArray, star_dn: float, exposures: int
 ) -> dict[str, FloatArray]:
-    """Sigma of attitudes about the boresight and across it (3,), by centroider, of stars of a
-    light at places on the detector (2, n).
+    """Sigma of attitudes about the boresight and across it (3,), arcsec, by centroider.
+
+    The stars have one light, and stand at places on the detector (2, n), px.
     """
     settings = DetectorSettings(
         gain_e_per_dn=GAIN_E_PER_DN,
@@ -361,10 +362,10 @@ def scatter_arcsec(
 
 
 def attitude_error(field: RigField, x_px: FloatArray, y_px: FloatArray) -> FloatArray | None:
-    """The error of an attitude by centroids: turns about z, x and y (3,), arcsec; None of under
-    three stars.
+    """The error of an attitude by centroids: turns about z, x and y (3,), arcsec; None with fewer
+    than three stars.
 
-    Each centroid is the star's that is nearest, within MATCHED_PX of its own pixel.
+    A centroid belongs to the nearest star within MATCHED_PX.
     """
     off_x = x_px[:, None] - field.pixel_px[0]
     off_y = y_px[:, None] - field.pixel_px[1]
@@ -397,7 +398,7 @@ SCATTER_AXES: dict[str, Callable[[Sequence[float] | FloatArray], float]] = {
 
 
 def fitted_light_dn(field: RigField, exposures: int) -> float:
-    """The light of a star by which FITTED scatters across the boresight as it is published."""
+    """The light of a star, DN, at which FITTED scatters across the boresight as published."""
     by_light = []
     for star_dn in LIGHTS_DN:
         scatter = scatter_arcsec(field, field.pixel_px, star_dn, exposures)
@@ -437,7 +438,8 @@ def scatter_rows(quick: bool) -> list[RigFigure]:
 
 
 def constant_rows(codes_share: float) -> list[RigFigure]:
-    """What the panel alone does to an attitude, however often it is measured: nobody states it.
+    """The error that the panel's pixels give an attitude and no average removes; no source states
+    it.
 
     `codes_share` is the error of hilstar's codes over that of one pixel a star.
     """
@@ -458,7 +460,7 @@ def constant_rows(codes_share: float) -> list[RigFigure]:
 
 
 def naples_rows() -> list[RigFigure]:
-    """What pixels alone do to attitudes of the tracker's stars."""
+    """The errors that pixels alone give the tracker's attitudes."""
     turns = pixel_attitudes_arcsec(NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_PIXEL_ARCSEC)
     rows = []
     for axis, published, predicted in zip(SCATTER_AXES, NAPLES_ARCSEC, turns, strict=True):
@@ -470,8 +472,9 @@ def naples_rows() -> list[RigFigure]:
 def pixel_attitudes_arcsec(
     stars: int, field_deg: tuple[float, float], pixel_arcsec: float
 ) -> tuple[float, float]:
-    """Errors of attitudes by so many stars anywhere in a field, each in the middle of its panel's
-    pixel: rms about the boresight, and of an axis across it.
+    """Errors of attitudes by stars that stand in the middles of their panel's pixels, rms.
+
+    Returns the error about the boresight, and that of an axis across it.
     """
     rng = np.random.default_rng(SEED)
     half = np.tan(np.radians(field_deg) / 2)
@@ -493,14 +496,14 @@ def unit_rays(slopes: FloatArray) -> FloatArray:
 
 
 def p13_rows() -> list[RigFigure]:
-    """The largest error along an axis of a star on the pixel that it falls into."""
+    """The largest error along an axis of a star on the pixel it falls into."""
     predicted = P13_RESOLUTION_ARCSEC / 2
     figure = "largest error of a place"
     return [RigFigure.of(P13, figure, "arcsec", P13_ARCSEC, predicted, P13_SOURCE)]
 
 
 def finding_of(rows: Sequence[RigFigure]) -> str:
-    """What each way leaves on one panel."""
+    """The error of places by each way on one panel."""
     first = rows[0]
     return (
         f"one pixel a star leaves {first.predicted:.1f} arcsec rms an axis on LASSI's"

@@ -45,7 +45,7 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, slots=True)
 class Isolation:
-    """Margin of a window around a star's sprites, px, and the share of its light that other
+    """The margin of a window around a star's sprites, px, and the share of its light that other
     stars may add there.
     """
 
@@ -100,8 +100,8 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
 
 
 def held_out_by_type(rates: FloatArray) -> FloatArray:
-    """Relative error (2m,) of each spectrum's rate by type, over `bare_and_dusty`; each star is
-    held out with its dusty one.
+    """Relative error (2m,) of each rate by spectral type, over `bare_and_dusty`; each star is held
+    out together with its dusty copy.
     """
     library = bare_and_dusty()
     kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
@@ -126,8 +126,7 @@ def lone_windows(
     size_px: tuple[int, int],
     isolation: Isolation,
 ) -> Iterator[tuple[int, Window]]:
-    """Each isolated star whose window lies on an image of `size_px` (width, height), with that
-    window.
+    """Each isolated star with its window, where that lies on an image of `size_px` (width, height).
 
     `x_px` and `y_px` (n,) are the places of the sprites on that image. A window is rows and
     columns.
@@ -137,33 +136,31 @@ def lone_windows(
     margin = isolation.margin_px
     for star in np.unique(sprites.star):
         is_own = sprites.star == star
-        left = x_px[is_own].min() - margin
-        right = x_px[is_own].max() + margin
-        top = y_px[is_own].min() - margin
-        bottom = y_px[is_own].max() + margin
-        if left < 0 or top < 0 or right > width - 1 or bottom > height - 1:
+        first_x = x_px[is_own].min() - margin
+        last_x = x_px[is_own].max() + margin
+        first_y = y_px[is_own].min() - margin
+        last_y = y_px[is_own].max() + margin
+        if first_x < 0 or first_y < 0 or last_x > width - 1 or last_y > height - 1:
             continue
-        near = (x_px > left - margin) & (x_px < right + margin)
-        near &= (y_px > top - margin) & (y_px < bottom + margin)
+        near = (x_px > first_x - margin) & (x_px < last_x + margin)
+        near &= (y_px > first_y - margin) & (y_px < last_y + margin)
         others = light[near & ~is_own].sum()
         if others <= isolation.max_share * light[is_own].sum():
-            rows = slice(int(top), int(bottom) + 1)
-            columns = slice(int(left), int(right) + 1)
+            rows = slice(int(first_y), int(last_y) + 1)
+            columns = slice(int(first_x), int(last_x) + 1)
             yield int(star), (rows, columns)
 
 
 def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
-    """The windows of an image, each alone in the middle of a square as wide as the widest: (n,
-    side, side), side odd.
-    """
+    """The windows of an image, each in the middle of an equal square: (n, side, side), side odd."""
     sides = [part.stop - part.start for window in windows for part in window]
     side = max(sides) | 1
     stamps = np.zeros((len(windows), side, side))
     for square, window in zip(stamps, windows, strict=True):
         height, width = image[window].shape
-        top = (side - height) // 2
-        left = (side - width) // 2
-        square[top : top + height, left : left + width] = image[window]
+        row = (side - height) // 2
+        column = (side - width) // 2
+        square[row : row + height, column : column + width] = image[window]
     return stamps
 
 
@@ -223,13 +220,13 @@ def lone_errors(bench: Bench, turn: CameraTurn, levels: Levels) -> LoneErrors:
             continue  # clips at some places within a pixel
         errors.append(star_error(shown, true, window))
         windows.append(window)
-    seen = bench.renderer.target.seen
+    optics = bench.renderer.target.seen
     off_px = stamp_errors(
         squares(shown, windows),
         squares(true, windows),
         bench.psf.width_px,
-        seen.blur_px,
-        seen.pixel_px,
+        optics.blur_px,
+        optics.pixel_px,
         box_share=NO_THRESHOLD,
     )
     return LoneErrors(tuple(errors), off_px)

@@ -75,13 +75,14 @@ MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
 
 @dataclass(frozen=True, slots=True)
 class GeometryFit:
-    """The smallest sufficient model of the displacements, as true minus assumed.
+    """How the display's geometry is off, true minus assumed, by the smallest model that explains
+    the stars' displacements.
 
-    Scale, rotation about the detector's middle and shift, and where the displacements ask for them
-    the screen's tilt about its x and y axes and the lens, k1 of its tangents; `tilt_px` and
-    `distortion_px` are the largest displacements by these. `left` is the share of the mean square
-    that is not explained, corrected for the number of unknowns, `left_px` what 95 % of the stars
-    are within of the model.
+    Scale, rotation about the detector's middle and shift; where the displacements ask for them also
+    the screen's tilt about its x and y axes, and the lens, k1 of its tangents. `tilt_px` and
+    `distortion_px` are the largest displacements by these two. `left` is the share of the mean
+    square that the model does not explain, corrected for the number of unknowns; 95 % of the stars
+    are within `left_px` of the model.
     """
 
     scale_error: float
@@ -156,8 +157,8 @@ def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class _MotionFit:
-    """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them
-    leave.
+    """A least-squares fit of displacements: the values of its unknowns by part, the displacements
+    (2 n,) that each part makes, and the rest (2 n,).
     """
 
     found: dict[str, FloatArray]
@@ -198,7 +199,9 @@ def _lengths(residuals: FloatArray) -> FloatArray:
 
 
 def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> GeometryFit:
-    """A fit, which leads from the display back to the sky, the other way round."""
+    """The figures of a fit. A fit leads from the display back to the sky, and its figures the other
+    way.
+    """
     scale, rotation, right, down = fit.found[ALIGNED].tolist()
     backwards = complex(1.0 + scale, rotation)
     forwards = 1.0 / backwards
@@ -223,13 +226,12 @@ def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> Geometry
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """One star at its place on the tracker, px: errors of the display, + too faint, right and down,
-    magnitudes and px.
+    """One star at its place on the tracker, px, and the errors of the display there.
 
-    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN
-    where that star would
-    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue
-    and sky. A body has a `name`, and 0 for `hip`.
+    `flux_mag` is positive where the star is too faint, `dx_px` and `dy_px` are right and down.
+    `codes_mag`, `codes_px` are what the codes alone would cost on the monitor that the bench
+    assumes, NaN where that star would be lost. `floor_mag`, `floor_px` are the estimator's own
+    errors: of the linear image against catalogue and sky. A body has a `name`, and 0 for `hip`.
     """
 
     hip: int
@@ -248,15 +250,15 @@ class Star:
 
 @dataclass(slots=True)
 class MatchTally:
-    """Stars by what became of them, added up over the fields.
+    """Stars by what became of them, over all fields.
 
-    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced`
-    has the rows (`fit_geometry`) of the stars that the display really shows, however far off.
-    `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
-    screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the
-    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`,
-    `channels_mag` how much too faint each channel is of those whose colour the primaries have;
-    there are `out_of_gamut` others.
+    `summed` stars are part of a brighter one from which the tracker cannot tell them. `displaced`
+    has the rows (`fit_geometry`) of all stars that the display shows, however far off. `vanished`
+    is how many fewer are found than the sky has; `mirrored` counts, by mirror, those found where a
+    screen so mirrored would show them. `noisy_mag`, `noisy_px` are the errors with all of the
+    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`.
+    `channels_mag` has how much too faint each channel is, of stars whose colour the primaries have;
+    `out_of_gamut` counts the others.
     """
 
     stars: list[Star] = field(default_factory=list)
@@ -486,6 +488,7 @@ class Comparison:
         return len(self.twin.bench.stars) * field_sr / (4 * math.pi)
 
     def _glow(self) -> GlowFit:
+        """The glow of the screen's black as assumed and as seen, and what it may be off."""
         limit_e_per_s_px = self.twin.config.verify.black_e_per_s_px
         if limit_e_per_s_px is None:
             sigma_x, sigma_y = self.finder.psf.width_px

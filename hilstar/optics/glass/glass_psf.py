@@ -19,7 +19,14 @@ from numpy.polynomial.polynomial import polyvander
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.optics.glass.psf_file import MAX_NEGATIVE, TOLERANCE, Glass, moment_carriers, principal
+from hilstar.optics.glass.psf_file import (
+    MAX_NEGATIVE,
+    TOLERANCE,
+    Glass,
+    moment_carriers,
+    offsets,
+    principal,
+)
 from hilstar.optics.psf import (
     BLACK_SAMPLES,
     MAX_FOOTPRINT_PX,
@@ -42,12 +49,13 @@ MAX_STEPS, MIN_STEPS, TABLE_SIDE, PLACES_A_PX = 4, 2, 1024, 32
 # What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids
 # and second moments are kept.
 STAMP_TOLERANCE = 3e-4
-FIRST_STAMPS, MAX_STAMPS = 48, 400
+FIRST_STAMPS, MAX_STAMPS = 48, 400  # the first number that is tried, doubled up to the last
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
-MAX_GRID_DEGREE = 4
-ON_EDGE_PX = 1e-6
+MAX_GRID_DEGREE = 4  # of splines over a full grid
+ON_EDGE_PX = 1e-6  # of the field's scale: rounding, by which a point on the hull is outside it
 SMALLEST, DARK = 1e-15, 1e-12  # numbers, and illuminations, that count as none
-SPRITES_AT_ONCE_PX = 2_000_000
+SPRITES_AT_ONCE_PX = 2_000_000  # bounds the memory: their stamps take 8 MB
+# samples to a pixel; rounds in which a weight becomes as wide as a PSF
 MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
 # basis images of the simpler glasses that may stand for one
 COMPONENTS = (3, 6, 12)
@@ -57,9 +65,10 @@ Kernel = Literal["linear", "thin_plate_spline", "quintic"]
 
 
 class NodeSpline:
-    """Functions of one variable, one of each of `nodes` (k,), rising: 1 there, 0 at the others.
+    """Interpolation in one variable: for each of its `nodes` (k,), which rise, a function that is 1
+    at that node and 0 at the others.
 
-    Beyond the nodes the values at their ends count.
+    Beyond the first and the last node the functions keep their values there.
     """
 
     def __init__(self, nodes: FloatArray, max_degree: int = MAX_DEGREE) -> None:
@@ -68,8 +77,10 @@ class NodeSpline:
 
         self._nodes = nodes
         self._spline = None
-        self._middle = (nodes[-1] + nodes[0]) / 2
-        self._half = (nodes[-1] - nodes[0]) / 2 or 1.0
+        first = nodes[0]
+        last = nodes[-1]
+        self._middle = (last + first) / 2
+        self._half = (last - first) / 2 or 1.0
         if len(nodes) > max_degree + 1:
             self._spline = make_interp_spline(nodes, np.eye(len(nodes)), max_degree)
         else:  # one polynomial, which is quicker
@@ -89,17 +100,19 @@ class NodeSpline:
 
 
 class Field:
-    """Functions over the field, one of each of its points (F, 2): 1 there, 0 at the others, smooth
-    between.
+    """Interpolation over the field: for each of its points (F, 2), px, a smooth function that is 1
+    at that point and 0 at the others.
 
-    On a full grid they are products of splines, elsewhere radial basis functions with polynomials.
-    Beyond the points' convex hull they have the values of its nearest place.
+    On a full grid the functions are products of splines, elsewhere radial basis functions with
+    polynomials. Beyond the points' convex hull they keep the values at the nearest place of its
+    edge.
     """
 
     def __init__(self, places_px: FloatArray) -> None:
         self.places_px = places_px
         self._middle_px = places_px.mean(axis=0)
-        self._scale = max(1.0, float(np.abs(places_px - self._middle_px).max()))
+        farthest_px = float(np.abs(places_px - self._middle_px).max())
+        self._scale = max(1.0, farthest_px)
         self._degree = 0
         for degree in range(MAX_DEGREE + 1):
             if self._holds(degree):
@@ -112,7 +125,9 @@ class Field:
         grid = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
         self._grid = None
         if grid.shape == places_px.shape and (grid == places_px).all():
-            self._grid = NodeSpline(columns, MAX_GRID_DEGREE), NodeSpline(rows, MAX_GRID_DEGREE)
+            across = NodeSpline(columns, MAX_GRID_DEGREE)
+            down = NodeSpline(rows, MAX_GRID_DEGREE)
+            self._grid = (across, down)
 
     def _scaled(self, places_px: FloatArray) -> FloatArray:
         """Places from the points' mean, in units of the farthest point's distance."""
@@ -136,7 +151,8 @@ class Field:
         if self._holds(1):
             from scipy.spatial import ConvexHull
 
-            return [int(k) for k in ConvexHull(self.places_px).vertices]
+            hull = ConvexHull(self.places_px)
+            return [int(k) for k in hull.vertices]
         along = self.places_px @ np.ptp(self.places_px, axis=0)
         return sorted({int(along.argmin()), int(along.argmax())})
 
@@ -147,16 +163,18 @@ class Field:
         places = np.stack([x_px, y_px], axis=1)
         beyond_px = np.zeros(len(places))
         begin = self.hull_px
-        along = np.roll(self.hull_px, -1, axis=0) - self.hull_px
+        along = np.roll(begin, -1, axis=0) - begin
         off = places[:, None] - begin
         cross_px = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
         if len(begin) > 2:
-            outside = np.flatnonzero((cross_px < -ON_EDGE_PX * self._scale).any(axis=1))
+            is_outside = (cross_px < -ON_EDGE_PX * self._scale).any(axis=1)
+            outside = np.flatnonzero(is_outside)
         else:
             outside = np.arange(len(places))  # a line or a point has no inside
         if len(outside):
             length2 = np.maximum((along * along).sum(axis=1), 1e-300)
-            part = np.clip((off[outside] * along).sum(axis=2) / length2, 0, 1)
+            advance = (off[outside] * along).sum(axis=2)
+            part = np.clip(advance / length2, 0, 1)
             on_edges = begin + part[..., None] * along
             far_px = np.linalg.norm(on_edges - places[outside, None], axis=2)
             star = np.arange(len(outside))
@@ -167,6 +185,7 @@ class Field:
 
     @cached_property
     def _scattered(self) -> Callable[[FloatArray], FloatArray]:
+        """The functions (n, F) at scaled places (n, 2), of points that are no grid."""
         from scipy.interpolate import RBFInterpolator
 
         kernels: tuple[Kernel, ...] = "linear", "thin_plate_spline", "quintic", "quintic"
@@ -195,12 +214,13 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class _Stamps:
-    """Stamps, images of the light of pixels, from which PSFs are mixed: `stamps` (R, side^2).
+    """Images of the light of pixels, `stamps` (R, side^2), of which every star's image is a
+    weighted sum.
 
-    The coefficient of a stamp is a polynomial of a star's place within its pixel. `parts` (squares,
-    6 K, R) are the polynomials' coefficients for each basis image and each square of a pixel, in
-    the order of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light of pixels
-    by basis image at all tabulated places.
+    The weight of a stamp is a quadratic function of the star's place within its pixel, by squares
+    of the pixel. `parts` (squares, 6 K, R) are its coefficients for each basis image, in the order
+    of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light that pixels get of
+    each basis image at all tabulated places.
     """
 
     stamps: Float32Array
@@ -225,15 +245,17 @@ class Focused:
 
 
 class _Measured(SampledPsf):
-    """An image whose width is wanted, and which no star is drawn by."""
+    """An image of which only the width is asked for. No star is drawn by it, so negative light is
+    no fault.
+    """
 
     max_negative = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class GlassPsf(SampledPsf):
-    """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in
-    the field's middle.
+    """A glass at one focus. Each star is drawn by its place and its spectrum, all other light by
+    the mean PSF in the middle of the field.
 
     `mean_shares` (L,) are the shares that each wavelength has of light without a spectrum of its
     own. Make it with `glass_psf`.
@@ -267,10 +289,11 @@ class GlassPsf(SampledPsf):
     def width_px(self) -> tuple[float, float]:
         """The smaller of the mean's and the sharpest PSF's: paths are sampled for all."""
         basis = self.optics.basis
-        peaks = (self._psf_weights @ basis.reshape(len(basis), -1)).max(axis=1)
-        sharpest = np.tensordot(self._psf_weights[peaks.argmax()], basis, axes=1).clip(min=0)
+        psfs = self._psf_weights @ basis.reshape(len(basis), -1)
+        highest = psfs.max(axis=1).argmax()
+        sharpest = np.tensordot(self._psf_weights[highest], basis, axes=1)
         widths = []
-        for samples in (self.samples, sharpest):
+        for samples in (self.samples, sharpest.clip(min=0)):
             image = _Measured(samples, self.per_px, self.pixel_integrated)
             widths.append(image.width_px)
         x, y = np.min(widths, axis=0).tolist()
@@ -282,10 +305,14 @@ class GlassPsf(SampledPsf):
         light.
         """
         _, height, width = self.optics.basis.shape
-        y, x = np.indices((height, width))
-        ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
-        light = np.stack([np.bincount(ring, image.ravel()) for image in self.optics.basis])
-        light_within = np.cumsum(self._psf_weights @ light, axis=1)
+        down = np.abs(offsets(height))
+        across = np.abs(offsets(width))
+        ring = np.maximum(down[:, None], across).ravel()
+        rings = []
+        for image in self.optics.basis:
+            rings.append(np.bincount(ring, image.ravel()))
+        light = self._psf_weights @ np.stack(rings)
+        light_within = np.cumsum(light, axis=1)
         cut = np.abs(1 - light_within).max(axis=0)
         too_much = np.flatnonzero(cut > MAX_CUT)
         last_ring = 0
@@ -293,7 +320,8 @@ class GlassPsf(SampledPsf):
             last_ring = min(int(too_much[-1]) + 1, len(cut) - 1)
         # samples of which pixels are integrated have light from half a pixel around them
         pixel_half_px = 0.5 if self.pixel_integrated else 0.0
-        side = 2 * math.ceil((last_ring + 0.5) / self.per_px + pixel_half_px) + 1
+        reach_px = (last_ring + 0.5) / self.per_px + pixel_half_px
+        side = 2 * math.ceil(reach_px) + 1
         if side > MAX_FOOTPRINT_PX:
             raise InputError(
                 f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what"
@@ -303,8 +331,12 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def peak_share(self) -> float:
-        """The largest of the sharpest PSF, where a star is in a pixel's middle, and of the mean."""
-        return max(float(self._table.max()), float(self._centred().max()))
+        """The largest share that one pixel gets: of the sharpest PSF, for a star in the middle of a
+        pixel, or of the mean PSF at any place.
+        """
+        of_mean = float(self._table.max())
+        of_any = float(self._centred().max())
+        return max(of_mean, of_any)
 
     def _centred(self) -> Float32Array:
         """The light (F L, side^2) of the pixels about a star in the middle of a pixel, by each of
@@ -320,7 +352,7 @@ class GlassPsf(SampledPsf):
         """
         side = self.footprint_px
         star_px = np.arange(steps + 1)[:, None] / steps - 0.5
-        at_px = (np.arange(side) - side // 2 - star_px).ravel()
+        at_px = (offsets(side) - star_px).ravel()
         tables = []
         for size in self.optics.basis.shape[1:]:
             pixels = _pixels_of(size, self.per_px, at_px, self.pixel_integrated)
@@ -336,8 +368,9 @@ class GlassPsf(SampledPsf):
         row_table, column_table = self._tabulated(PLACES_A_PX)
         largest = 0.0
         for line, table in ((rows, row_table), (columns, column_table)):
-            third_differences = line @ np.diff(table, 3, axis=0).swapaxes(1, 2)
-            largest = max(largest, float(np.abs(third_differences).max()))
+            differences = np.diff(table, 3, axis=0)
+            of_lines = line @ differences.swapaxes(1, 2)
+            largest = max(largest, float(np.abs(of_lines).max()))
         # over a square of 1 px, by Chebyshev's
         cubic = largest * PLACES_A_PX**3 / 192
         squares = math.ceil(np.cbrt(cubic / CUBIC_TOLERANCE))
@@ -353,29 +386,34 @@ class GlassPsf(SampledPsf):
         steps_a_pixel = min(TABLE_SIDE // side, MAX_STEPS * 6)
         steps_a_square = min(MAX_STEPS, max(MIN_STEPS, steps_a_pixel // squares))
         steps = steps_a_square * squares
+        places_a_side = steps + 1
         count = len(self.optics.basis)
         row_table, column_table = self._tabulated(steps)
         down = _normal_floats(row_table.reshape(-1, row_table.shape[2]))
         across = _normal_floats(column_table.reshape(-1, column_table.shape[2]))
         # images are tabulated as strong as they are used: small ones need less care
-        rms_weights = np.sqrt((self.optics.weights**2).mean(axis=(0, 1)))
-        used = np.maximum(rms_weights, 1e-30).astype(np.float32)
+        mean_squares = (self.optics.weights**2).mean(axis=(0, 1))
+        used = np.maximum(np.sqrt(mean_squares), 1e-30).astype(np.float32)
         basis = _normal_floats(self.optics.basis)
-        table = np.empty((count, (steps + 1) ** 2, side * side), dtype=np.float32)
+        table = np.empty((count, places_a_side**2, side * side), dtype=np.float32)
         for image, scale, image_table in zip(basis, used, table, strict=True):
-            pixels = (down @ (scale * image) @ across.T).reshape(steps + 1, side, steps + 1, side)
-            image_table[:] = pixels.transpose(0, 2, 1, 3).reshape(image_table.shape)
+            pixels = down @ (scale * image) @ across.T
+            by_axis = pixels.reshape(places_a_side, side, places_a_side, side)
+            image_table[:] = by_axis.transpose(0, 2, 1, 3).reshape(image_table.shape)
         stamps, coefficients = _few(table.reshape(-1, side * side), side)
         by_place = coefficients.reshape(count, -1) / used[:, None]
-        by_place = by_place.reshape(count, steps + 1, steps + 1, -1)
+        by_place = by_place.reshape(count, places_a_side, places_a_side, -1)
         places = np.linspace(-1, 1, steps_a_square + 1)
         y, x = np.meshgrid(places, places, indexing="ij")
-        fit = np.linalg.pinv(_terms(x.ravel(), y.ravel())).astype(np.float32)
+        terms = _terms(x.ravel(), y.ravel())
+        fit = np.linalg.pinv(terms).astype(np.float32)
         parts = np.empty((squares**2, fit.shape[0], count, len(stamps)), dtype=np.float32)
         for number, square_parts in enumerate(parts):
             row, column = divmod(number, squares)
-            rows = slice(steps_a_square * row, steps_a_square * (row + 1) + 1)
-            columns = slice(steps_a_square * column, steps_a_square * (column + 1) + 1)
+            first_row = steps_a_square * row
+            first_column = steps_a_square * column
+            rows = slice(first_row, first_row + steps_a_square + 1)
+            columns = slice(first_column, first_column + steps_a_square + 1)
             square = by_place[:, rows, columns].reshape(count, -1, len(stamps))
             square_parts[:] = np.tensordot(fit, square, axes=(1, 1))
         light = table.sum(axis=2) / used[:, None]
@@ -383,8 +421,8 @@ class GlassPsf(SampledPsf):
         return _Stamps(stamps, by_square, stamps.sum(axis=1), light)
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
-        """How much stars at places (n,) have of each basis image (n, K); `shares` as
-        spectra of `Psf`.
+        """The weights (n, K) of the basis images in the light of stars at places (n,); `shares` are
+        spectra as in `Psf`.
         """
         by_field = self.field(x_px, y_px).T.astype(np.float32)
         shares = shares.T.astype(np.float32, order="C")
@@ -399,19 +437,21 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def _light(self) -> Float32Array:
-        """The weights of each point's and wavelength's light (F L, K): a PSF's, times its
-        illumination inside the image.
+        """The weights (F L, K) of the basis images in the light of each field point and wavelength:
+        those of its PSF, times its illumination inside the image.
         """
         optics = self.optics
-        light = optics.weights * (optics.illumination * optics.inside)[..., None]
-        return np.asarray(light.reshape(-1, len(optics.basis)), dtype=np.float32)
+        inside = optics.illumination * optics.inside
+        light = optics.weights * inside[..., None]
+        by_psf = light.reshape(-1, len(optics.basis))
+        return np.asarray(by_psf, dtype=np.float32)
 
     def _parts(self, weights: Float32Array, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
         """The coefficients (n, R) of the stamps for stars at places (n,), sorted by `_square`, with
         `weights` (n, K) of the basis images.
         """
-        square, *within = _square(x_px, y_px, self._squares)
-        terms = _terms(*within).astype(np.float32)[:, :, None]
+        square, within_x, within_y = _square(x_px, y_px, self._squares)
+        terms = _terms(within_x, within_y).astype(np.float32)[:, :, None]
         stamp_parts = self._stamps.parts
         counts = np.bincount(square, minlength=self._squares**2)
         parts = np.empty((len(terms), stamp_parts.shape[2]), dtype=np.float32)
@@ -421,19 +461,18 @@ class GlassPsf(SampledPsf):
             if count:
                 begin = end
                 end = end + count
-                products = np.multiply(terms[begin:end], weights[begin:end, None], out=room[:count])
-                np.matmul(products.reshape(count, -1), stamp_part, out=parts[begin:end])
+                stars = slice(begin, end)
+                products = np.multiply(terms[stars], weights[stars, None], out=room[:count])
+                np.matmul(products.reshape(count, -1), stamp_part, out=parts[stars])
         return parts
 
     @cached_property
     def moved_px(self) -> FloatArray:
         """The centroid of each PSF from its chief ray (F, L, 2), px."""
         _, height, width = self.optics.basis.shape
-        x = np.arange(width) - width // 2
-        y = np.arange(height) - height // 2
         basis = self.optics.basis
-        moment_x = basis.sum(axis=1) @ x
-        moment_y = basis.sum(axis=2) @ y
+        moment_x = basis.sum(axis=1) @ offsets(width)
+        moment_y = basis.sum(axis=2) @ offsets(height)
         moments = np.stack([moment_x, moment_y], axis=1)
         return np.asarray(self.optics.weights @ moments / self.per_px)
 
@@ -452,11 +491,13 @@ class GlassPsf(SampledPsf):
         lit = total > DARK
         divisor = np.where(lit, total, 1)
         centroids = []
-        for place_px, moved_px in zip((x_px, y_px), np.moveaxis(self.moved_px, 2, 0), strict=True):
+        moved_by_axis = np.moveaxis(self.moved_px, 2, 0)
+        for place_px, moved_px in zip((x_px, y_px), moved_by_axis, strict=True):
             moment = ((by_field @ (light * moved_px)) * spectra).sum(axis=1)
             centroids.append(place_px + np.where(lit, moment / divisor, 0))
         x, y = centroids
-        return x, y, ((by_field @ optics.illumination) * spectra).sum(axis=1)
+        illumination = ((by_field @ optics.illumination) * spectra).sum(axis=1)
+        return x, y, illumination
 
     def stamps_at(
         self,
@@ -467,13 +508,19 @@ class GlassPsf(SampledPsf):
     ) -> Float32Array:
         """See `Psf.stamps_at`: each by its place and spectrum."""
         rates = np.ones(len(x_px)) if electrons_per_s is None else electrons_per_s
-        order = np.argsort(_square(x_px, y_px, self._squares)[0])
+        order = self._by_square(x_px, y_px)
         star_spectra = spectra[order] if spectra.ndim == 2 else spectra
         stamps, scale = self._drawn(x_px[order], y_px[order], star_spectra)
+        factors = rates[order] * scale
         squares = np.empty_like(stamps)
-        squares[order] = stamps * (rates[order] * scale)[:, None]
+        squares[order] = stamps * factors[:, None]
         side = self.footprint_px
         return squares.reshape(-1, side, side)
+
+    def _by_square(self, x_px: FloatArray, y_px: FloatArray) -> IntArray:
+        """The stars at places (n,) in the order of their squares, as `_drawn` wants them."""
+        square, _, _ = _square(x_px, y_px, self._squares)
+        return np.argsort(square)
 
     def _drawn(
         self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
@@ -490,18 +537,18 @@ class GlassPsf(SampledPsf):
         return parts @ self._stamps.stamps, np.asarray(scale, dtype=np.float32)
 
     def unreduced(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
-        """The same of stars of 1 electron per second, by the whole basis: exact, and some
-        hundred times as slow.
+        """The light (n, side, side) about stars of 1 electron per second by the whole basis: what
+        `_drawn` approximates, exact and some hundred times as slow.
         """
         side = self.footprint_px
-        at_px = np.arange(side) - side // 2
+        at_px = offsets(side)
         stamps = np.empty((len(x_px), side, side))
         mixed = self._mixed(x_px, y_px, shares)
         for stamp, weights, x, y in zip(stamps, mixed, x_px, y_px, strict=True):
             image = np.tensordot(weights.astype(np.float64), self.optics.basis, axes=1)
             height, width = image.shape
-            down_px = at_px - (y - np.floor(y + 0.5))
-            across_px = at_px - (x - np.floor(x + 0.5))
+            down_px = at_px - _in_pixel(y)
+            across_px = at_px - _in_pixel(x)
             down = _pixels_of(height, self.per_px, down_px, self.pixel_integrated)
             across = _pixels_of(width, self.per_px, across_px, self.pixel_integrated)
             stamp[:] = down @ image @ across.T
@@ -527,20 +574,24 @@ class GlassPsf(SampledPsf):
         pixel = np.arange(side, dtype=np.int32)
         stamp_pixels = (pixel[:, None] * across + pixel).ravel()
         at_once = max(1, SPRITES_AT_ONCE_PX // side**2)
-        order = np.argsort(_square(x_px, y_px, self._squares)[0])
+        order = self._by_square(x_px, y_px)
         image = np.empty(0, np.float32)
         for begin in range(0, max(len(order), 1), at_once):
             star = order[begin : begin + at_once]
             star_spectra = spectra[star] if spectra.ndim == 2 else spectra
             stamps, scale = self._drawn(x_px[star], y_px[star], star_spectra)
-            column = np.floor(x_px[star] + 0.5).astype(np.int32) + side - side // 2
-            row = np.floor(y_px[star] + 0.5).astype(np.int32) + side - side // 2
+            middle_column = np.floor(x_px[star] + 0.5).astype(np.int32)
+            middle_row = np.floor(y_px[star] + 0.5).astype(np.int32)
+            column = middle_column + side - side // 2
+            row = middle_row + side - side // 2
             places = (row * across + column)[:, None] + stamp_pixels
             ends = np.arange(len(star) + 1, dtype=np.int32) * side**2
-            sparse = csc_array((stamps.ravel(), places.ravel(), ends), (size, len(star)))
+            content = (stamps.ravel(), places.ravel(), ends)
+            sparse = csc_array(content, (size, len(star)))
             light = np.asarray(sparse @ (electrons_per_s[star] * scale))
             image = image + light if begin else light
-        return image.reshape(-1, across)[side:-side, side:-side]
+        with_room = image.reshape(-1, across)
+        return with_room[side:-side, side:-side]
 
     @property
     def in_the_middle(self) -> SampledPsf:
@@ -571,7 +622,8 @@ class GlassPsf(SampledPsf):
         wide = np.pad(self.optics.basis, ((0, 0), (more, more), (more, more)))
         spread = []
         for image in wide:
-            spread.append(np.fft.ifft2(fourier_gaussian(np.fft.fft2(image), sigma)).real)
+            transformed = fourier_gaussian(np.fft.fft2(image), sigma)
+            spread.append(np.fft.ifft2(transformed).real)
         return _of_optics(self, replace(self.optics, basis=np.stack(spread)))
 
 
@@ -579,7 +631,8 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
     """A glass at one of its focus positions, or between them. Raises InputError for PSFs that
     cannot be drawn.
     """
-    at_focus = NodeSpline(glass.focuses_um)(np.array([focus_um]))[0]
+    over_focus = NodeSpline(glass.focuses_um)
+    at_focus = over_focus(np.array([focus_um]))[0]
     weights = np.tensordot(glass.weights, at_focus, axes=(2, 0))
     illumination = np.tensordot(glass.illumination, at_focus, axes=(2, 0))
     inside = np.tensordot(1 - glass.outside, at_focus, axes=(2, 0))
@@ -616,7 +669,7 @@ def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[Floa
     old_half = np.array([width, height]) // 2
     new_half = np.ceil(np.abs(np.linalg.inv(to_samples)) @ old_half)
     half_x, half_y = new_half.astype(int).tolist()
-    y, x = np.indices((2 * half_y + 1, 2 * half_x + 1)) - np.array([half_y, half_x])[:, None, None]
+    x, y = np.meshgrid(offsets(2 * half_x + 1), offsets(2 * half_y + 1))
     columns, rows = np.tensordot(to_samples, np.stack([x, y]), axes=1)
     at = np.stack([rows + height // 2, columns + width // 2])
     drawn = []
@@ -628,7 +681,8 @@ def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[Floa
 
 def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
     """The PSF (height, width) of the field's middle and of light with such shares (L,)."""
-    middle = field(*field.places_px.mean(axis=0)[:, None])[0]
+    middle_x, middle_y = field.places_px.mean(axis=0)[:, None]
+    middle = field(middle_x, middle_y)[0]
     weights = np.einsum("f,l,flk->k", middle, shares, optics.weights)
     return np.asarray(np.tensordot(weights, optics.basis, axes=1))
 
@@ -647,9 +701,11 @@ def with_components(psf: GlassPsf, count: int) -> GlassPsf:
     basis = optics.basis.reshape(len(optics.basis), -1)
     mean = flat.mean(axis=0)
     values, vectors = np.linalg.eigh(basis @ basis.T)
+    positive = np.maximum(values, 1e-12 * values[-1])
     # its square is the metric of weights
-    scale = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
-    turned, sizes, components = np.linalg.svd((flat - mean) @ scale, full_matrices=False)
+    scale = vectors * np.sqrt(positive)
+    departures = (flat - mean) @ scale
+    turned, sizes, components = np.linalg.svd(departures, full_matrices=False)
     independent = int((sizes > 1e-9 * sizes[0]).sum())
     component_count = min(count - 1, independent)
     component_weights = components[:component_count] @ np.linalg.pinv(scale)
@@ -665,14 +721,13 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     """
     optics = psf.optics
     side = psf.footprint_px
-    rows, columns = np.indices((side, side))
-    pixel = np.stack([columns.ravel(), rows.ravel()], axis=1) - side // 2
     _, height, width = optics.basis.shape
-    y, x = np.indices((height, width))
-    place = np.stack([x.ravel() - width // 2, y.ravel() - height // 2], axis=1) / psf.per_px
+    pixel = _grid_offsets(side, side)
+    place = _grid_offsets(height, width) / psf.per_px
     stamps = psf._centred().astype(np.float64)
+    centroids = psf.moved_px.reshape(-1, 2)
     images = []
-    for stamp, centroid in zip(stamps, psf.moved_px.reshape(-1, 2), strict=True):
+    for stamp, centroid in zip(stamps, centroids, strict=True):
         spread = _adaptive_spread(stamp, pixel - centroid)
         if not psf.pixel_integrated:
             spread = spread - np.eye(2) * PIXEL_VARIANCE
@@ -692,7 +747,8 @@ def _adaptive_spread(light: FloatArray, off: FloatArray) -> FloatArray:
     spread = np.eye(2)
     for _ in range(WIDTH_ROUNDS):
         weighted = light * _gaussian(off, spread)
-        spread = 2 * (off.T * weighted) @ off / weighted.sum()
+        moments = 2 * (off.T * weighted) @ off
+        spread = moments / weighted.sum()
         smallest = float(np.linalg.eigvalsh(spread)[0])
         spread += np.eye(2) * max(0.0, least - smallest)
     return spread
@@ -708,15 +764,16 @@ def _of_images(psf: GlassPsf, images: FloatArray, weights: FloatArray) -> GlassP
     """A glass by other images (K, m) and weights (n, K) of its PSFs."""
     basis = images.reshape(-1, *psf.optics.basis.shape[1:])
     light = weights @ images.sum(axis=1)
-    weights = (weights / light[:, None]).reshape(*psf.optics.weights.shape[:2], -1)
-    return _of_optics(psf, replace(psf.optics, basis=basis, weights=weights))
+    fields, wavelengths, _ = psf.optics.weights.shape
+    of_light = (weights / light[:, None]).reshape(fields, wavelengths, -1)
+    return _of_optics(psf, replace(psf.optics, basis=basis, weights=of_light))
 
 
 def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
-    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus
-    needs fewer components.
+    """A glass whose PSFs are moved by `lateral` (F, L, 2) samples, right and down, on a basis made
+    for its one focus, which needs fewer components.
 
-    Pixels have `width` samples, 1 where they are integrated.
+    A pixel has `width` samples; 1 where pixels are integrated.
     """
     from scipy.ndimage import shift
 
@@ -734,7 +791,8 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
     images /= images.sum(axis=(1, 2), keepdims=True)
     flat_images = images.reshape(len(images), -1)
     basis, weights, _ = principal(flat_images, images.shape[1:], TOLERANCE, width)
-    weights /= (weights @ basis.sum(axis=1, dtype=np.float64))[:, None]
+    light = weights @ basis.sum(axis=1, dtype=np.float64)
+    weights /= light[:, None]
     new_basis = basis.reshape(-1, *images.shape[1:]).astype(np.float64)
     new_weights = weights.reshape(*optics.weights.shape[:2], -1)
     return replace(optics, basis=new_basis, weights=new_weights)
@@ -746,11 +804,26 @@ def _square(
     """In which square of its pixel each star (n,) is, and its place in it, -1 to 1 right and
     down.
     """
-    at_x = (x_px - np.floor(x_px + 0.5) + 0.5) * squares
-    at_y = (y_px - np.floor(y_px + 0.5) + 0.5) * squares
+    at_x = (_in_pixel(x_px) + 0.5) * squares
+    at_y = (_in_pixel(y_px) + 0.5) * squares
     column = np.minimum(at_x.astype(np.intp), squares - 1)
     row = np.minimum(at_y.astype(np.intp), squares - 1)
-    return row * squares + column, 2 * (at_x - column) - 1, 2 * (at_y - row) - 1
+    within_x = 2 * (at_x - column) - 1
+    within_y = 2 * (at_y - row) - 1
+    return row * squares + column, within_x, within_y
+
+
+def _in_pixel(place_px: FloatArray) -> FloatArray:
+    """Places from the middles of the pixels that they are in, px."""
+    return np.asarray(place_px - np.floor(place_px + 0.5))
+
+
+def _grid_offsets(rows: int, columns: int) -> IntArray:
+    """How far each sample of an image is right of the middle one and below it, (n, 2), row by
+    row.
+    """
+    x, y = np.meshgrid(offsets(columns), offsets(rows))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -765,11 +838,12 @@ def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> F
     from scipy.interpolate import make_interp_spline
 
     unit_images = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
-    place_px = (np.arange(len(unit_images)) - len(unit_images) // 2) / per_px
+    place_px = offsets(len(unit_images)) / per_px
     spline = make_interp_spline(place_px, unit_images, SPLINE_DEGREE)
     last_px = place_px[-1]
     if integrated:
-        return np.asarray(spline(np.clip(at_px, -last_px, last_px)) * per_px)
+        density = spline(np.clip(at_px, -last_px, last_px))
+        return np.asarray(density * per_px)
     light = spline.antiderivative()
     low = light(np.clip(at_px - 0.5, -last_px, last_px))
     high = light(np.clip(at_px + 0.5, -last_px, last_px))
@@ -784,13 +858,15 @@ def _normal_floats(values: FloatArray) -> Float32Array:
 
 
 def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
-    """Rows (R, side^2), and the coefficients (n, R) by which they make those of a table to
+    """Few rows (R, side^2) and coefficients (n, R), whose product is the table (n, side^2) to
     STAMP_TOLERANCE.
 
     Flux, centroids and second moments are kept exactly. Random projections find the principal
-    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same.
+    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same ones.
     """
-    carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
+    exact_carriers, exact_terms = moment_carriers((side, side), 1.0)
+    carriers = exact_carriers.astype(np.float32)
+    terms = exact_terms.astype(np.float32)
     moments = table @ terms
     rest = table - moments @ carriers
     rng = np.random.default_rng(0)
@@ -820,7 +896,8 @@ def _orthonormal(columns: Float32Array | FloatArray) -> Float32Array:
     """Orthonormal columns that span those given, by their products with each other: QR takes far
     longer on long ones.
     """
-    values, vectors = np.linalg.eigh((columns.T @ columns).astype(np.float64))
+    products = columns.T @ columns
+    values, vectors = np.linalg.eigh(products.astype(np.float64))
     good = values > 1e-9 * values[-1]
     to_orthonormal = vectors[:, good] / np.sqrt(values[good])
     return np.asarray(columns @ to_orthonormal, dtype=np.float32)

@@ -1,11 +1,11 @@
 """A glass from a lens's prescription: optiland traces it, and its rays become PSFs with
 diffraction.
 
-Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k
-(path + L (x - x_ray) +
-M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the
-angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would need too many rays,
-because what diffraction spreads is far finer than the aberrations, rays are counted as they fall.
+Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k (path
++ L (x - x_ray) + M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid
+angle of each (the angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would
+need too many rays, because what diffraction spreads is far finer than the aberrations, rays are
+counted as they fall.
 
 Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its
 middle on the chief ray of the field's middle, its axes the surface's own.
@@ -30,7 +30,7 @@ from hilstar.optics.camera import Lens
 from hilstar.optics.glass.codev_file import read_codev
 from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription, LensSurface
 from hilstar.optics.glass.optiland_lens import optic_of
-from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places
 from hilstar.optics.glass.zemax_file import read_zemax
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
@@ -50,6 +50,7 @@ MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does n
 # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
 PERIOD_MARGIN = 2.0
 FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
+# Newton's rounds from a place to its field; distortion is fitted to rays along spokes of the field
 CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
 EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
 MIN_LIT = 1e-3  # share of a pupil below which a field point is dark
@@ -236,8 +237,8 @@ class _LensRays:
             field.vx = field.vy = 0.0
         self.wavelengths_um = sorted({float(w.value) for w in optic.wavelengths.wavelengths})
         self.primary_um = float(optic.primary_wavelength)
-        self.focal_length_mm = abs(float(np.asarray(optic.paraxial.f2()).ravel()[0]))
-        self.f_number = abs(float(np.asarray(optic.paraxial.FNO()).ravel()[0]))
+        self.focal_length_mm = _size_of(optic.paraxial.f2())
+        self.f_number = _size_of(optic.paraxial.FNO())
         if not math.isfinite(self.focal_length_mm) or not self.wavelengths_um:
             raise InputError(
                 "it has no focal length or no wavelength; write a lens that forms an image"
@@ -257,8 +258,9 @@ class _LensRays:
             )
         # A lens with one field, on the axis, has no direction in which its image could be turned
         # round.
-        outward = (tangents[1] - tangents[0]) @ (places[1] - places[0])
-        self.sign = float(np.sign(outward)) or 1.0
+        tangent_step = tangents[1] - tangents[0]
+        place_step = places[1] - places[0]
+        self.sign = float(np.sign(tangent_step @ place_step)) or 1.0
         self.centre_mm = places[0]
 
     def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
@@ -268,8 +270,10 @@ class _LensRays:
         from_plane = np.stack([rays.x, rays.y, rays.z - self._image_mm[2]])
         places = self._to_image.T @ from_plane
         cosines = self._to_image.T @ np.stack([rays.L, rays.M, rays.N])
-        moved = self._to_image.T @ np.array([*self._image_mm[:2], 0.0])
-        return places[:2] - moved[:2, None] - self.centre_mm[:, None], cosines
+        across_mm, down_mm, _ = self._image_mm
+        moved = self._to_image.T @ np.array([across_mm, down_mm, 0.0])
+        from_middle = places[:2] - moved[:2, None] - self.centre_mm[:, None]
+        return from_middle, cosines
 
     def chiefs(self, fields: FloatArray, um: float) -> tuple[FloatArray, FloatArray]:
         """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields
@@ -279,7 +283,9 @@ class _LensRays:
         pupil_middle = np.zeros(len(fields))
         generate = self.optic.ray_tracer.ray_generator.generate_rays
         starts = generate(x, y, pupil_middle, pupil_middle, um)
-        tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
+        tangent_x = starts.L / starts.N
+        tangent_y = starts.M / starts.N
+        tangents = self.sign * np.stack([tangent_x, tangent_y], axis=1)
         rays = self.optic.trace_generic(x, y, pupil_middle, pupil_middle, um)
         places, _ = self.at_image(rays)
         return tangents, places.T
@@ -292,19 +298,21 @@ class _LensRays:
             return np.zeros_like(places_mm)
         near_axis = np.array([[0.0, 0.0], [0.0, EDGE]])
         tangents, _ = self.chiefs(near_axis, self.primary_um)
-        slope_mm = camera.focal_length_mm * float(tangents[1, 1] - tangents[0, 1]) / EDGE
+        tangent_step = float(tangents[1, 1] - tangents[0, 1])
+        slope_mm = camera.focal_length_mm * tangent_step / EDGE
         fields = places_mm / slope_mm
         for _ in range(CHIEF_ROUNDS):
             fields = np.clip(fields, -1.5, 1.5)
             tangents, _ = self.chiefs(fields, self.primary_um)
-            fields = fields + (places_mm - camera.places_mm(tangents)) / slope_mm
+            off_mm = places_mm - camera.places_mm(tangents)
+            fields = fields + off_mm / slope_mm
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
         """Rays of a pupil's grid (n, n) from a field (2,), relative to the largest, at a
         wavelength.
         """
-        at = (np.arange(rays) + 0.5) / rays * 2 - 1
+        at = pupil_places(rays)
         across, down = np.meshgrid(at, at)
         filled = _filled(rays)
         radius = float(np.hypot(*field))
@@ -318,8 +326,10 @@ class _LensRays:
         moved_along = shift - along_cut * along
         moved_beside = beside_cut * beside
         # beyond it only where no light is
-        px = np.clip(across + moved_along * turn_x - moved_beside * turn_y, -1, 1)
-        py = np.clip(down + moved_along * turn_y + moved_beside * turn_x, -1, 1)
+        vignetted_x = across + moved_along * turn_x - moved_beside * turn_y
+        vignetted_y = down + moved_along * turn_y + moved_beside * turn_x
+        px = np.clip(vignetted_x, -1, 1)
+        py = np.clip(vignetted_y, -1, 1)
         hx = np.full(px.size, field[0])
         hy = np.full(px.size, field[1])
 
@@ -328,13 +338,20 @@ class _LensRays:
 
         generate = self.optic.ray_tracer.ray_generator.generate_rays
         start = generate(hx, hy, px.ravel(), py.ravel(), um)
-        x0, y0, z0 = on_grid(start.x), on_grid(start.y), on_grid(start.z)
-        l0, m0, n0 = on_grid(start.L), on_grid(start.M), on_grid(start.N)
+        x0 = on_grid(start.x)
+        y0 = on_grid(start.y)
+        z0 = on_grid(start.z)
+        l0 = on_grid(start.L)
+        m0 = on_grid(start.M)
+        n0 = on_grid(start.N)
         end = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
         places, cosines = self.at_image(end)
-        x, y = on_grid(places[0]), on_grid(places[1])
-        path, light = on_grid(end.opd), on_grid(end.i)
-        good = (filled > 0) & np.isfinite(x + y + path) & (light > 0)
+        x = on_grid(places[0])
+        y = on_grid(places[1])
+        path = on_grid(end.opd)
+        light = on_grid(end.i)
+        arrives = np.isfinite(x + y + path) & (light > 0)
+        good = (filled > 0) & arrives
         # A plane wave's path up to where its rays start, and the area of the beam that each ray
         # stands for.
         path = path + l0 * x0 + m0 * y0 + n0 * z0
@@ -375,10 +392,16 @@ def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
 @lru_cache(maxsize=4)
 def _filled(rays: int) -> FloatArray:
     """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
-    fine = (np.arange(rays * FINER) + 0.5) / (rays * FINER) * 2 - 1
-    inside = fine**2 + fine[:, None] ** 2 <= 1
+    fine = pupil_places(rays * FINER)
+    radius2 = fine**2 + fine[:, None] ** 2
+    inside = radius2 <= 1
     cells = inside.reshape(rays, FINER, rays, FINER)
     return np.asarray(cells.mean(axis=(1, 3)))
+
+
+def _size_of(value: Any) -> float:
+    """The absolute value of a figure that Optiland gives as a number or as an array of one."""
+    return abs(float(np.asarray(value).ravel()[0]))
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -399,7 +422,7 @@ def _glass(
     fields = lens.fields_at(places * pitch_mm, camera)
     samples = per_px or _samples_a_px(lens, plate)
     side = 2 * plate.half_px * samples + 1
-    grid = side, pitch_mm / samples
+    grid = (side, pitch_mm / samples)
     images = []
     at = []
     facts = []
@@ -416,11 +439,12 @@ def _glass(
             for focus_um in sorted(set(plate.focuses_um)):
                 focused_mm = chief_mm + slopes * focus_um * 1e-3
                 if light > MIN_LIT:
-                    ray_of_light = field, um, focus_um * 1e-3
+                    ray_of_light = (field, um, focus_um * 1e-3)
                     image, outside = _psf(lens, ray_of_light, focused_mm, grid)
                     illumination = min(light, 2.0)
                 else:
-                    image, outside = _dark(side), 0.0
+                    image = _dark(side)
+                    outside = 0.0
                     illumination = 0.0
                 moved = focused_mm / pitch_mm - place
                 images.append(image)
@@ -449,7 +473,8 @@ def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
         return np.zeros((1, 2))
     _, edge_mm = lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)
     edge_px = float(np.linalg.norm(edge_mm)) / (plate.pitch_um * 1e-3)
-    scale = min(1.0, edge_px / float(np.hypot(*half)))
+    corner_px = float(np.hypot(*half))
+    scale = min(1.0, edge_px / corner_px)
     half_x, half_y = half * scale
     columns = np.unique(np.linspace(-half_x, half_x, POINTS))
     rows = np.unique(np.linspace(-half_y, half_y, POINTS))
@@ -459,8 +484,8 @@ def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
 
 def _slopes(lens: _LensRays, field: FloatArray, um: float) -> FloatArray:
     """How far (2,) a field's chief ray moves right and down for a step away from the lens."""
-    x, y = field[:1], field[1:]
-    rays = lens.optic.trace_generic(x, y, np.zeros(1), np.zeros(1), um)
+    pupil_middle = np.zeros(1)
+    rays = lens.optic.trace_generic(field[:1], field[1:], pupil_middle, pupil_middle, um)
     _, cosines = lens.at_image(rays)
     across, down, along = cosines[:, 0]
     return np.array([across / along, down / along])
@@ -486,7 +511,8 @@ def _psf(
     """
     field, um, defocus_mm = light
     side, step_mm = grid
-    needed = math.ceil(PERIOD_MARGIN * side * step_mm / (um * 1e-3 * lens.f_number))
+    wave_mm = um * 1e-3
+    needed = math.ceil(PERIOD_MARGIN * side * step_mm / (wave_mm * lens.f_number))
     if needed > MAX_RAYS:
         rays = lens.bundle(field, um, GEOMETRIC_RAYS)
         return _counted(rays, defocus_mm, centre, side, step_mm)
@@ -503,11 +529,13 @@ def _waves(
     side, step_mm = grid
     fringe_mm = um * 1e-3 * 0.5 * _fastest(rays)
     finer = max(1, math.ceil(step_mm / fringe_mm) // 2 * 2 + 1)
-    at_mm = (np.arange(side * finer) - (side * finer) // 2) * step_mm / finer
+    samples = side * finer
+    at_mm = (np.arange(samples) - samples // 2) * step_mm / finer
     wave = 2 * np.pi / (um * 1e-3)
     cos_x, cos_y, cos_z = rays.cosines
     # Solid angle times its cosine; of a cell at the pupil's edge both light and angle are a part.
-    angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y))) * _filled(len(rays.x))
+    whole_angle = np.abs(_determinant(cos_x, cos_y))
+    angle = np.nan_to_num(whole_angle) * _filled(len(rays.x))
     lit = rays.light > 0
     moved_x = rays.x - centre[0]
     moved_y = rays.y - centre[1]
@@ -517,17 +545,19 @@ def _waves(
     angle = angle[lit]
     cos_x = cos_x[lit]
     cos_y = cos_y[lit]
-    amplitude = np.sqrt(light * angle) * np.exp(1j * wave * path)
+    phase = np.exp(1j * wave * path)
+    amplitude = np.sqrt(light * angle) * phase
     # a phase that no light shows
     middle_x = np.average(cos_x, weights=light)
     middle_y = np.average(cos_y, weights=light)
     across = np.exp(1j * wave * np.outer(cos_x - middle_x, at_mm))
     down = np.exp(1j * wave * np.outer(cos_y - middle_y, at_mm))
-    image = np.abs((down * amplitude[:, None]).T @ across) ** 2
+    waves = (down * amplitude[:, None]).T @ across
+    intensity = np.abs(waves) ** 2
     # Parseval: the integral over the image is the wavelength squared times that of the squared
     # amplitude over solid angles.
     total = float(light.sum()) * (um * 1e-3 / (step_mm / finer)) ** 2
-    image = image.reshape(side, finer, side, finer).sum(axis=(1, 3))
+    image = intensity.reshape(side, finer, side, finer).sum(axis=(1, 3))
     return image, float(np.clip(1 - image.sum() / total, 0, 0.999))
 
 
@@ -535,7 +565,9 @@ def _fastest(rays: _Bundle) -> float:
     """The F-number of the fastest beam, across or down, that has light."""
     lit = rays.light > 0
     cos_x, cos_y, _ = rays.cosines
-    widest = float(max(np.ptp(cos_x[lit]), np.ptp(cos_y[lit])))
+    across = np.ptp(cos_x[lit])
+    down = np.ptp(cos_y[lit])
+    widest = float(max(across, down))
     return 1 / max(1e-6, widest)
 
 
@@ -574,7 +606,7 @@ class _Chiefs:
     lens: Lens | None
 
     def places_mm(self, tangents: FloatArray) -> FloatArray:
-        """Where it has directions (n, 2)."""
+        """Places (n, 2), mm from the detector's middle, of directions (n, 2) by their tangents."""
         if self.lens is None:
             return np.asarray(self.focal_length_mm * tangents)
         u, v = self.lens.bent(*tangents.T)
@@ -588,7 +620,8 @@ class _Chiefs:
         turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)
         radius = np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]
         spokes = np.stack([np.sin(turn), np.cos(turn)], axis=1)
-        fields = (radius[:, None, None] * spokes).reshape(-1, 2)
+        fields = radius[:, None, None] * spokes
+        fields = fields.reshape(-1, 2)
         tangents, places = lens.chiefs(fields, lens.primary_um)
         known = np.isfinite(places).all(axis=1)
         largest = float(np.hypot(*tangents.T).max())
@@ -596,11 +629,17 @@ class _Chiefs:
         places = places[known] / largest
         r2 = u * u + v * v
         # A column of equations for each coefficient: all places' x, then all places' y.
-        radial = [np.concatenate([u * r2**power, v * r2**power]) for power in range(4)]
-        p1_column = np.concatenate([2 * u * v, r2 + 2 * v * v])
-        p2_column = np.concatenate([r2 + 2 * u * u, 2 * u * v])
-        columns = np.stack([*radial, p1_column, p2_column], axis=1)
-        solution, *_ = np.linalg.lstsq(columns, places.T.ravel(), rcond=None)
+        columns = []
+        for power in range(4):
+            columns.append(np.concatenate([u * r2**power, v * r2**power]))
+        p1_x = 2 * u * v
+        p1_y = r2 + 2 * v * v
+        p2_x = r2 + 2 * u * u
+        p2_y = 2 * u * v
+        columns.append(np.concatenate([p1_x, p1_y]))
+        columns.append(np.concatenate([p2_x, p2_y]))
+        equations = np.stack(columns, axis=1)
+        solution, *_ = np.linalg.lstsq(equations, places.T.ravel(), rcond=None)
         focal, *distortion = solution.tolist()
         # of tangents relative to the largest: turned back to tangents
         coefficients = []

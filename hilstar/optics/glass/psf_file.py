@@ -168,6 +168,16 @@ def glass_of(
     return made
 
 
+def pupil_places(count: int) -> FloatArray:
+    """The middles (count,) of equal parts of a pupil's axis, -1 to 1."""
+    return np.asarray((np.arange(count) + 0.5) / count * 2 - 1)
+
+
+def offsets(count: int) -> IntArray:
+    """How far each of so many samples of a row is from the middle one, samples."""
+    return np.arange(count) - count // 2
+
+
 def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, FloatArray]:
     """Six images (6, m) that carry one moment each, and the moments' own terms (m, 6), of images of
     a shape (height, width).
@@ -176,10 +186,13 @@ def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, F
     moments' carriers have of it has none of these moments, and neither has any sum of such images.
     """
     middle = np.array(shape)[:, None, None] // 2
-    y, x = ((np.indices(shape) - middle) / sigma).reshape(2, -1)
+    from_middle = (np.indices(shape) - middle) / sigma
+    y, x = from_middle.reshape(2, -1)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    weighted = np.exp(-(x * x + y * y) / 2)[:, None] * terms
-    return np.linalg.pinv(terms.T @ weighted) @ weighted.T, terms
+    weight = np.exp(-(x * x + y * y) / 2)
+    weighted = weight[:, None] * terms
+    to_moments = np.linalg.pinv(terms.T @ weighted)
+    return to_moments @ weighted.T, terms
 
 
 def principal(
@@ -197,7 +210,8 @@ def principal(
         return images.astype(np.float32), np.eye(len(images)), 0.0
     mean = images.mean(axis=0)
     # a Gaussian of this sigma has the mean image's sum of squares
-    sigma = float(1 / np.sqrt(4 * np.pi * (mean @ mean)))
+    squares = mean @ mean
+    sigma = float(1 / np.sqrt(4 * np.pi * squares))
     carriers, terms = moment_carriers(shape, sigma)
     moments = images @ terms
     rest = images - moments @ carriers
@@ -294,6 +308,7 @@ def _check(glass: Glass) -> None:
 
 
 def _check_numbers(glass: Glass) -> None:
+    """Raise InputError for figures that are not finite, or beyond what their kind can have."""
     if glass.per_px < 1:
         raise InputError(f"PSFs of {glass.per_px} samples a pixel; write 1 or more")
     numbers = (
@@ -320,13 +335,14 @@ def _check_numbers(glass: Glass) -> None:
 
 
 def _check_psfs(glass: Glass) -> None:
+    """Raise InputError for a PSF that does not sum to 1, lies beside its chief ray, or is too
+    negative.
+    """
     binned = [_binned(image, glass.per_px) for image in glass.basis]
     _, height, width = glass.basis.shape
-    x = np.arange(width) - width // 2
-    y = np.arange(height) - height // 2
     light = glass.basis.sum(axis=(1, 2))
-    moment_x = glass.basis.sum(axis=1) @ x
-    moment_y = glass.basis.sum(axis=2) @ y
+    moment_x = glass.basis.sum(axis=1) @ offsets(width)
+    moment_y = glass.basis.sum(axis=2) @ offsets(height)
     moments = np.stack([light, moment_x, moment_y], axis=1)
     for f, wavelength, focus in np.ndindex(*glass.weights.shape[:3]):
         weights = glass.weights[f, wavelength, focus]
@@ -349,7 +365,7 @@ def _check_psfs(glass: Glass) -> None:
 
 
 def _binned(image: Float32Array, per_px: int) -> FloatArray:
-    """Sums over about a pixel each."""
+    """An image's sums over squares of about a pixel."""
     height, width = image.shape
     first_rows = np.arange(0, height, per_px)
     first_columns = np.arange(0, width, per_px)

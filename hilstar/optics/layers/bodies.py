@@ -37,7 +37,7 @@ MAX_POSED_PX = 120
 # Poses in an exposure for each sigma that the camera moves: a limb is then a chain of edges at most
 # 1.6 sigma apart.
 EXPOSED_PER_SIGMA = 1.0
-MAX_EXPOSED = 63
+MAX_EXPOSED = 63  # poses, which bounds an exposure's work; odd, so that one is in the middle
 # places of a limb that are asked whether they are hidden: a body hides another's outline as a whole
 LIMB_PLACES = 24
 LATTICE = 9  # places along each side of a disc's rectangle at which clipping is tested
@@ -282,6 +282,6 @@ def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | No
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:
-    """The places of discs among `stars`, whose last are the bodies."""
+    """The rows of bodies among `stars`, by name: bodies are the last rows."""
     last_first = stars.bodies[::-1]  # a satellite may have a body's name; satellites come before
     return np.array([len(stars) - 1 - last_first.index(name) for name in names], dtype=np.intp)

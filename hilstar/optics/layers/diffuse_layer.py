@@ -8,6 +8,7 @@ PSF's variance, times its solid angle. The camera's turn within a frame, which c
 little, is left out.
 """
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -22,14 +23,14 @@ from hilstar.optics.sprites import FrameLight
 from hilstar.sky.diffuse import TangentImage
 from hilstar.sky.stars import Stars
 
-CELL_PX = 16
-ON_EDGE_PX = 0.01
+CELL_PX = 16  # side of cells: places are computed at their corners, and linear between these
+ON_EDGE_PX = 0.01  # of a tangent image: two faces of a cube both hold their common edge
 MOVED_PX = 0.25  # at most, by taking one attitude for a cell of them
 
 
 class DiffuseLayer:
-    """The light of tangent images in electrons/s/sr; of a monitor only cells that pass its first
-    step in a pixel.
+    """Diffuse light of the sky, from tangent images in electrons/s/sr. A monitor is given only the
+    cells of its image in which a pixel passes its first step.
     """
 
     def __init__(self, images: tuple[TangentImage, ...], canvas: Canvas) -> None:
@@ -37,16 +38,19 @@ class DiffuseLayer:
         self._faintest = canvas.first_step_e_per_s
         camera = canvas.camera
         smallest_px_rad, largest_px_rad = camera.scales_px_rad()
-        finest_rad, coarsest_rad = 1 / largest_px_rad, 1 / smallest_px_rad
+        finest_rad = 1 / largest_px_rad
+        coarsest_rad = 1 / smallest_px_rad
         width, height = camera.resolution_px
-        columns, rows = -(-width // CELL_PX) + 1, -(-height // CELL_PX) + 1
-        self._counts = columns, rows
+        columns = math.ceil(width / CELL_PX) + 1
+        rows = math.ceil(height / CELL_PX) + 1
+        self._counts = (columns, rows)
         self._across = linear_shares(width, columns)
         self._down = linear_shares(height, rows)
         places = camera.grid_px(self._counts)
         rays = camera.rays(*places).reshape(rows, columns, 3)
         self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        self._sr = np.nan_to_num(camera.pixel_sr(*places)).reshape(rows, columns)
+        pixel_sr = np.nan_to_num(camera.pixel_sr(*places))
+        self._sr = pixel_sr.reshape(rows, columns)
         largest_sr = self._sr.max()
         least = self._faintest / largest_sr
         sigma_px = math.sqrt(math.fsum(canvas.psf.variance_px2) / 2)
@@ -58,8 +62,10 @@ class DiffuseLayer:
             self._brightest = max(self._brightest, float(brightest * largest_sr))
             if brightest > least:
                 self._faces.append(_Face(smoothed, coarsest_rad, least))
-        self._middles = np.array([face.middle for face in self._faces]).reshape(-1, 3)
-        reach_rad = math.acos(float(np.nanmin(self._rays[..., 2])))
+        middles = [face.middle for face in self._faces]
+        self._middles = np.array(middles).reshape(-1, 3)
+        smallest_cosine = float(np.nanmin(self._rays[..., 2]))
+        reach_rad = math.acos(smallest_cosine)
         radii_rad = np.arccos([face.cos_radius for face in self._faces])
         self._cos_reach = np.cos(np.minimum(radii_rad + reach_rad, np.pi))
         # Half a step of each component turns by twice that, and moves the image's farthest pixel.
@@ -68,8 +74,8 @@ class DiffuseLayer:
         self._kept: tuple[FloatArray, tuple[LightMap, ...]] | None = None
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
-        """The light before, and the map's; a screen's is that of its attitude's cell, and the
-        same objects within a cell.
+        """The light before, and the map's. On a screen that is the map of the attitude's cell:
+        within a cell it is the same objects, which are uploaded once.
         """
         cell = view.q_icrs_to_cam
         if self._cell_q:
@@ -79,14 +85,16 @@ class DiffuseLayer:
         if self._kept is None or not np.array_equal(cell, self._kept[0]):
             icrs_to_cam = to_matrix(normalise(cell))
             boresight_cosines = self._middles @ icrs_to_cam[2]
-            near = [self._faces[k] for k in np.flatnonzero(boresight_cosines >= self._cos_reach)]
+            is_near = boresight_cosines >= self._cos_reach
+            near = list(itertools.compress(self._faces, is_near))
             taken = None
             if sum(face.is_of_cube for face in near) > 1:
                 taken = np.zeros(self._camera.resolution_px[::-1], dtype=bool)
             maps: list[LightMap] = []
             for face in near:
-                maps.extend(self._lit(face, icrs_to_cam, taken if face.is_of_cube else None))
-            self._kept = cell, tuple(maps)
+                face_taken = taken if face.is_of_cube else None
+                maps.extend(self._lit(face, icrs_to_cam, face_taken))
+            self._kept = (cell, tuple(maps))
         _, lights = self._kept
         if lights:
             return replace(light, extended=(*light.extended, *lights))
@@ -118,10 +126,14 @@ class DiffuseLayer:
         # no whole cell: its light is two cells and more beside the image
         if min(len(lit_rows), len(lit_columns)) < 2:
             return []
-        around = _span(lit_rows), _span(lit_columns)
+        around = (_span(lit_rows), _span(lit_columns))
         x_px, y_px = face.image.places_px(self._rays[around] @ icrs_to_cam)
-        bright = face.most_at(x_px, y_px) * self._sr[around] > self._faintest
-        cells = bright[:-1, :-1] | bright[1:, :-1] | bright[:-1, 1:] | bright[1:, 1:]
+        sr = self._sr[around]
+        bright = face.most_at(x_px, y_px) * sr > self._faintest
+        above = bright[:-1]
+        below = bright[1:]
+        either = above | below
+        cells = either[:, :-1] | either[:, 1:]
         groups, _ = label(cells)
         maps = []
         for number, box in enumerate(find_objects(groups), start=1):
@@ -130,10 +142,11 @@ class DiffuseLayer:
             y = part.spread(y_px)
             if taken is not None:
                 part.keep(face.holds(x, y), taken)
+            source = face.image.image
             image = map_coordinates(
-                face.image.image, [y, x], order=1, mode="grid-constant", output=np.float32
+                source, [y, x], order=1, mode="grid-constant", output=np.float32
             )
-            light = image * part.spread(self._sr[around]) * part.own
+            light = image * part.spread(sr) * part.own
             maps.append(LightMap(light, part.corner_px, bv_mag=face.image.bv_mag))
         return maps
 
@@ -148,15 +161,18 @@ class DiffuseLayer:
         width, height = self._camera.resolution_px
         y_px = _first_pixels(first_row, row_box.stop - row_box.start, height, rows)
         x_px = _first_pixels(first_column, column_box.stop - column_box.start, width, columns)
-        down = self._down[y_px[0] : y_px[-1], first_row : first_row + len(y_px)]
-        across = self._across[x_px[0] : x_px[-1], first_column : first_column + len(x_px)]
+        top = int(y_px[0])
+        left = int(x_px[0])
+        down = self._down[top : y_px[-1], first_row : first_row + len(y_px)]
+        across = self._across[left : x_px[-1], first_column : first_column + len(x_px)]
         own_rows = np.repeat(own, np.diff(y_px), axis=0)
+        own_pixels = np.repeat(own_rows, np.diff(x_px), axis=1)
         return _Part(
-            corner_px=(int(x_px[0]), int(y_px[0])),
+            corner_px=(left, top),
             nodes=tuple(slice(part.start, part.stop + 1) for part in box),
             down=down.astype(np.float32),
             across=across.astype(np.float32),
-            own=np.repeat(own_rows, np.diff(x_px), axis=1),
+            own=own_pixels,
         )
 
 
@@ -174,8 +190,8 @@ def _first_pixels(first_cell: int, cells: int, size_px: int, corners: int) -> In
 
 @dataclass(slots=True)
 class _Part:
-    """A rectangle of an image: its first pixel, its cells' corners, their shares in its rows and
-    columns, which are its own.
+    """A rectangle of an image: its first pixel (x, y), the corners of its cells, the shares of
+    these corners in its rows and columns, and which pixels are its own.
     """
 
     corner_px: tuple[int, int]
@@ -190,8 +206,8 @@ class _Part:
         return np.asarray(self.down @ corners @ self.across.T)
 
     def keep(self, held: BoolArray, taken: BoolArray) -> None:
-        """Leave pixels that are not `held` here or `taken` before, and take the others, in an
-        image's `taken` (h, w).
+        """Give up the pixels that are not `held` or that another face has in `taken` (h, w), and
+        note the others there.
         """
         left, top = self.corner_px
         rows, columns = self.own.shape
@@ -201,10 +217,11 @@ class _Part:
 
 
 class _Face:
-    """A tangent image, and the most light that any place has within a cell of it.
+    """A tangent image prepared for a camera: `most` is the largest light within a cell of any
+    place.
 
-    What has more light than `least` is within a radius of the direction `middle` (3,), ICRS, cells
-    that touch it included.
+    All that has more light than `least` is within a radius of the direction `middle` (3,), ICRS,
+    with the cells that it touches.
     """
 
     def __init__(self, image: TangentImage, px_rad: float, least: float) -> None:
@@ -216,13 +233,15 @@ class _Face:
         # From a corner to the far end of its cells, on a plane whose scale grows by 3 at a cube's
         # corner
         cell_px = CELL_PX * px_rad * image.px_per_tangent
-        self._reach_px = math.ceil(cell_px * 3 * math.sqrt(2)) + 1
+        farthest_px = cell_px * 3 * math.sqrt(2)
+        self._reach_px = math.ceil(farthest_px) + 1
         rows, columns = np.nonzero(image.image > least)
         right = columns - self.middle_px
         down = rows - self.middle_px
         forward = np.full(len(rows), image.px_per_tangent)
         lit = np.stack([right, down, forward], axis=-1)
-        lit = (lit / np.linalg.norm(lit, axis=1, keepdims=True)) @ image.axes
+        lit /= np.linalg.norm(lit, axis=1, keepdims=True)
+        lit = lit @ image.axes
         self.middle = lit.mean(axis=0)
         self.middle /= np.linalg.norm(self.middle)
         smallest_cosine = np.clip((lit @ self.middle).min(), -1.0, 1.0)
@@ -236,14 +255,16 @@ class _Face:
         size = len(self.most)
         x = np.nan_to_num(np.rint(x_px) + self._reach_px, nan=-1.0)
         y = np.nan_to_num(np.rint(y_px) + self._reach_px, nan=-1.0)
-        inside = (x >= 0) & (y >= 0) & (x < size) & (y < size)
+        across = (x >= 0) & (x < size)
+        down = (y >= 0) & (y < size)
+        inside = across & down
         row = (y * inside).astype(np.intp)
         column = (x * inside).astype(np.intp)
         return np.where(inside, self.most[row, column], 0.0)
 
     def holds(self, x_px: Float32Array, y_px: Float32Array) -> BoolArray:
-        """Which places are not beyond its edge, or hardly: two faces both hold a place on their
-        edge.
+        """True for places within the face's edge, or hardly beyond it: two faces both hold a place
+        on their common edge.
         """
         half_px = self.image.max_tangent * self.image.px_per_tangent + ON_EDGE_PX
         across = np.abs(x_px - self.middle_px) <= half_px

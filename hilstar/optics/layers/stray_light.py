@@ -23,7 +23,7 @@ from hilstar.optics.layers.fault_kinds import Gradient, MeasuredMap
 # a camera's pixels lie smoothly in another's: splines between every eighth are right to 1e-4 px
 GRID_PX = 8
 MAX_FILE_BYTES = 200_000_000
-MAX_SIDE_PX = 16_384
+MAX_SIDE_PX = 16_384  # a map of this side takes 2 GB as float64
 MAP_ADVICE = "give a FITS image, a greyscale PNG or an npy array of the whole detector"
 
 

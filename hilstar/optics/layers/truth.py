@@ -76,8 +76,11 @@ def truth_table(
     truth["temperature_k"] = stars.temperature_k[star]
     truth["electrons_per_s"] = stars.electrons_per_s[star]
     truth["drawn"] = True
-    truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
-    truth["ra_deg"], truth["dec_deg"] = to_radec_deg(stars.directions(star))
+    truth["sigma_pos_mas"] = np.nan
+    truth["sigma_mag"] = np.nan
+    ra_deg, dec_deg = to_radec_deg(stars.directions(star))
+    truth["ra_deg"] = ra_deg
+    truth["dec_deg"] = dec_deg
     listed = stars.row[star] >= 0
     row = stars.row[star[listed]]
     catalog = stars.catalog
@@ -85,8 +88,9 @@ def truth_table(
     truth["double"][listed] = catalog.multiple[row]
     for name in ("range_mag", "period_d", "separation_arcsec"):
         truth[name] = np.nan
+        values = getattr(catalog, name)[row]
         # Back to the catalogue's decimals from float32.
-        truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
+        truth[name][listed] = np.round(values.astype(np.float64), 3)
     return truth
 
 
@@ -135,7 +139,9 @@ def designations(stars: Stars, sprites: FrameLight, which: IntArray) -> tuple[in
     without one.
     """
     star = np.unique(sprites.star[which])
-    added = dict.fromkeys(sprites.added[-1 - k].name for k in star[star < 0])
+    added: dict[str, None] = {}
+    for k in star[star < 0].tolist():
+        added[sprites.added[-1 - k].name] = None
     return (*stars.designations(star[star >= 0]), *added)
 
 
@@ -249,7 +255,8 @@ def brightest_in_view(
     vectors = vectors[brightest]
     x_px = x_px[brightest]
     y_px = y_px[brightest]
-    off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
+    right, down, forward = cam.T
+    off_rad = np.arctan2(np.hypot(right, down), forward)
     ra_deg, dec_deg = to_radec_deg(vectors)
     constellations: list[str] = []
     if len(star_rows):

@@ -89,8 +89,8 @@ class Disc:
 
     @cached_property
     def sun_sphere(self) -> FloatArray:
-        """A place's product with this vector (3,) is the cosine of the Sun's angle times the
-        length of the normal.
+        """The vector (3,) whose product with a place of the sphere is the cosine of the Sun's angle
+        there, times the length of the normal.
         """
         return np.asarray(self.to_sphere @ self.sun)
 
@@ -197,10 +197,10 @@ class Disc:
         return self.touched_light(directions) * hidden, hidden
 
     def touched_light(self, directions: FloatArray) -> FloatArray:
-        """Electrons per second and steradian (n,) of ground that rays just touch, by the share of
-        light that air stops there.
+        """The radiance (n,), electrons per second and steradian, of ground that a ray just touches,
+        over the share of light that air stops there.
 
-        The rays have the sides of ICRS directions (n, 3).
+        Of ICRS directions (n, 3) only the side of the disc on which they lie counts.
         """
         sphere_directions = directions @ self.to_sphere.T
         sideways = sphere_directions[:, :2]

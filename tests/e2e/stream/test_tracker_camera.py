@@ -201,8 +201,9 @@ def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
         ended(process)
     counts = dict(re.findall(r"^(n_\w+) += (\d+)", tested.stdout, re.MULTILINE))
     assert int(counts["n_completed_buffers"]) > 0, tested.stdout + tested.stderr
-    # Late packets (n_failures) are a busy machine's; these are a camera's that breaks the standard.
-    for fault in ("n_size_mismatch_errors", "n_error_packets", "n_ignored_bytes"):
+    # Late packets (n_failures) and images for which it had no room (n_ignored_bytes) are a busy
+    # machine's; these are a camera's that breaks the standard.
+    for fault in ("n_size_mismatch_errors", "n_error_packets"):
         assert int(counts[fault]) == 0, tested.stdout
 
 

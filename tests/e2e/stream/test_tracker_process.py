@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tty
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -219,15 +220,9 @@ def test_a_watcher_that_never_reads_loses_frames_and_holds_up_none():
 )
 def test_what_is_wrong_gets_one_line(tmp_path, options, said):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    words = [
-        "tracker",
-        tmp_path / "bench.toml",
-        "--watch",
-        "tcp://127.0.0.1:1",
-        "--answer",
-        "udp://127.0.0.1:9",
-        *options,
-    ]
+    right = {"--watch": "tcp://127.0.0.1:1", "--answer": "udp://127.0.0.1:9"}
+    given = right | {options[0]: options[1]}
+    words = ["tracker", tmp_path / "bench.toml", *chain.from_iterable(given.items())]
     assert_refused(run_hilstar_here(*words), 2, said)
 
 

@@ -26,7 +26,7 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import Levels, Response, srgb_response
 from hilstar.instruments.study.codes import AIMS
-from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.instruments.study.stability import CaseFigures, FailureCase
 from hilstar.optics.psf import MAX_CUT, SQRT2, GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
@@ -35,7 +35,7 @@ from hilstar.sky.stars import make_stars, unit_vectors_icrs
 IMAGE_PX = (512, 512)
 MIDDLE_PX = 256
 OFF_MIDDLE_PX = (256.3, 256.0)
-SIGMA_PX = 0.85
+SIGMA_PX = 0.85  # of sprites by default
 SEED = 1
 # The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of
 # two.
@@ -74,7 +74,7 @@ CODES_SEED = 6
 # groups of stars along either side of the image, and the side of each one's part of it
 COUNT, TILE_PX = 8, 22
 SIDE_PX = COUNT * TILE_PX
-WHITE = 1.0
+WHITE = 1.0  # light of white, of which errors are shares
 FAINT_MAG = 6.0  # under the star whose peak is white
 NARROW_PX = 0.3
 # A star of equal steps can have its light within half of one and no nearer; where steps differ it
@@ -90,12 +90,12 @@ TOGETHER = (
 
 
 def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
-    """A linear image, whose stars are round."""
+    """A linear image with round stars."""
     return Target(size_px, GaussianPsf((sigma_px, sigma_px)))
 
 
 def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> FrameLight:
-    """A star of a target's sigma."""
+    """One star with the sigma of a target."""
     star = np.zeros(1, dtype=np.intp)
     x, y, rate = np.array([[x_px], [y_px], [electrons_per_s]])
     return pack_sprites(x, y, rate, star, on.resolution_px, on.psf.footprint_px)
@@ -122,8 +122,9 @@ def drawn(on: Target, sprites: FrameLight) -> FloatArray:
 def _outer(
     on: Target, sprites: FrameLight, shares: Callable[[FloatArray, float], FloatArray]
 ) -> FloatArray:
-    """One star's image from its shares along each axis, by a pixel's offset from it and sigma,
-    px.
+    """One star's image from its shares along each axis.
+
+    `shares` takes the pixels' offsets from the star, px, and its sigma, px.
     """
     width, height = on.resolution_px
     sigma_x, sigma_y = on.psf.width_px
@@ -230,7 +231,7 @@ def narrow_star() -> FailureCase:
         f"flux off by {ours.flux:.1e}; centre of gravity by {own_places}",
         "the Gaussian is integrated over pixels; pixels of any display keep that centroid error:"
         " write 0.5 px or more",
-        Figures(ours.flux, sampled.flux, FLUX_ERROR),
+        CaseFigures(ours.flux, sampled.flux, FLUX_ERROR),
     )
 
 
@@ -257,12 +258,12 @@ def wide_star() -> FailureCase:
         f"a pixel off by up to {100 * fault:.0f} % of the peak",
         f"{error:.0e} of the peak; the star's flux off by {image.sum() - 1:+.0e}",
         "float32 differences are small against the flux, and their errors cancel in the sum",
-        Figures(error, fault, PEAK_ERROR),
+        CaseFigures(error, fault, PEAK_ERROR),
     )
 
 
 def negative_wings() -> FailureCase:
-    """Far out both erfs are 1 but for rounding."""
+    """Far from a star both erfs are 1 but for rounding."""
     on = target(20.0)
     sprites = one_star(*OFF_MIDDLE_PX, on)
     bare = bare_polynomial(on, sprites)
@@ -274,7 +275,7 @@ def negative_wings() -> FailureCase:
         f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's",
         f"{error} negative pixels",
         "the shader takes the larger of difference and 0",
-        Figures(float(error), float(fault), NOTHING),
+        CaseFigures(float(error), float(fault), NOTHING),
     )
 
 
@@ -292,7 +293,7 @@ def floored_wings() -> FailureCase:
         f"adds {100 * fault:.1f} % to each star, over {width} x {height} pixels",
         f"flux off by {error:.0e}",
         "no floor: outside its footprint a star has no light",
-        Figures(error, fault, FLUX_ERROR),
+        CaseFigures(error, fault, FLUX_ERROR),
     )
 
 
@@ -318,7 +319,7 @@ def absurd_sigmas() -> FailureCase:
         f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
         f"refused: {' | '.join(refusals)}",
         "a point of GL is a star's footprint",
-        Figures(silently_cut, max(cuts), MAX_CUT),
+        CaseFigures(silently_cut, max(cuts), MAX_CUT),
     )
 
 
@@ -335,7 +336,7 @@ def star_on_pixel_edge() -> FailureCase:
         f"centre {fault_px:.2f} px off, to either side",
         f"centre {off_px:.0e} px off",
         "light goes to both pixels; place is whole pixel and float32 fraction",
-        Figures(off_px, fault_px, CENTROID_PX),
+        CaseFigures(off_px, fault_px, CENTROID_PX),
     )
 
 
@@ -364,7 +365,7 @@ def star_on_image_edge() -> FailureCase:
         f"up to {100 * fault:.0f} % of its light too much or too little",
         f"light on the image off by {error:.0e} of the star's",
         "a star is drawn where its footprint touches the image, and cut there",
-        Figures(error, fault, FLUX_ERROR),
+        CaseFigures(error, fault, FLUX_ERROR),
     )
 
 
@@ -406,7 +407,7 @@ def many_stars() -> FailureCase:
         f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x"
         f" {CORNER_PX}",
         "the GPU blends every sprite, in float32",
-        Figures(max(error, pixel_error), fault, CROWD_ERROR),
+        CaseFigures(max(error, pixel_error), fault, CROWD_ERROR),
     )
 
 
@@ -433,7 +434,7 @@ def flux_range() -> FailureCase:
         f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone",
         f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}",
         "float32, and each star in its own footprint",
-        Figures(max(errors), max(faults), FLUX_ERROR),
+        CaseFigures(max(errors), max(faults), FLUX_ERROR),
     )
 
 
@@ -455,13 +456,13 @@ def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[FrameLight
 
 
 def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
-    """Its light (steps,) in each image."""
+    """The moving star's light (steps,) in each image."""
     return np.array([draw(sprites).sum() for sprites in moving_star(on)])
 
 
 @cache  # a case and a chart
 def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
-    """The light (steps,) that an sRGB monitor makes of it, relative to the light wanted.
+    """The light (steps,) of the moving star on an sRGB monitor, relative to the wanted light.
 
     It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
     """
@@ -478,12 +479,12 @@ def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
 
 
 def ripple(fluxes: FloatArray) -> float:
-    """From the faintest to the brightest of a star's fluxes, relative to their mean."""
+    """The range of a star's fluxes, relative to their mean."""
     return float((fluxes.max() - fluxes.min()) / fluxes.mean())
 
 
 def ripple_mag(fluxes: FloatArray) -> float:
-    """From the faintest to the brightest of a star's fluxes, mag."""
+    """The range of a star's fluxes, mag."""
     return float(magnitude(float(fluxes.min() / fluxes.max())))
 
 
@@ -499,7 +500,7 @@ def popping() -> FailureCase:
         f"its light varies by {100 * fault:.1f} %",
         f"varies by {error:.1e} in the linear image",
         "integrated over pixels, and cut where 1e-6 of the light remains",
-        Figures(error, fault, RIPPLE),
+        CaseFigures(error, fault, RIPPLE),
     )
 
 
@@ -514,7 +515,7 @@ def popping_codes() -> FailureCase:
         f"its light varies by {fault:.3f} mag",
         f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
         "round adds up the errors of its pixels; exact chooses a star's codes together",
-        Figures(error, fault, AIMS[CODES_BITS][0]),
+        CaseFigures(error, fault, AIMS[CODES_BITS][0]),
     )
 
 
@@ -577,7 +578,7 @@ def error_steps(codes: Levels, scene: CodeScene) -> float:
 def sprites_of(
     x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float
 ) -> FrameLight:
-    """Stars at places (n,), so many magnitudes (n,) under the one whose peak is white."""
+    """Stars at places (n,), px, in magnitudes (n,) under the one whose peak is white."""
     psf = GaussianPsf((sigma_px, sigma_px))
     light = WHITE * flux_ratio(under_white_mag) / psf.peak_share
     star = np.arange(len(x_px))
@@ -615,7 +616,7 @@ def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
 
 
 def half_off() -> CodeScene:
-    """Stars whose middles lie on the screen's edges, at every phase along them and across."""
+    """Stars centred on the screen's edges, at every place within a pixel along and across them."""
     count = COUNT - 2
     along = middles()[0][1 : COUNT - 1]
     across = (np.roll(np.arange(count), 2) + 0.5) / count - 1.0
@@ -647,7 +648,7 @@ def judged(
         f"a star's light off by {fault:.2g} of the panel's smallest steps rms",
         f"by {error:.2g} steps",
         why,
-        Figures(error, fault, steps_a_star * scene.stars),
+        CaseFigures(error, fault, steps_a_star * scene.stars),
     )
 
 
@@ -723,7 +724,7 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
         " handed on",
         f"no pixel has more than {error:.1e} of white too much",
         "what is over white is lost, and told; no neighbour makes up for it",
-        Figures(error, fault, largest_step),
+        CaseFigures(error, fault, largest_step),
     )
 
 
@@ -764,7 +765,7 @@ def no_stars() -> FailureCase:
         f"{no_number:.0f} % of the pixels are no number",
         f"{100 * error:.0f} % of the pixels are lit",
         "full scale is the bench's, whatever a frame has",
-        Figures(error, float(scaled.sum()), NOTHING),
+        CaseFigures(error, float(scaled.sum()), NOTHING),
     )
 
 

@@ -29,6 +29,7 @@ from hilstar.instruments.certify.readings import (
     dot_places,
     geometry_of,
     grey_response,
+    light_in_squares,
 )
 from hilstar.instruments.certify.structure import in_place
 from hilstar.server.bench.bench_file import read_bench_file
@@ -37,6 +38,7 @@ from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.planted_certify import (
     BENCH,
+    LIGHT,
     REGIONS,
     coverage,
     coverage_by_images,
@@ -129,6 +131,18 @@ def test_codes_that_are_off_by_themselves_widen_the_response_between_those_read(
             assert np.mean(counted.held) > MIN_HELD, region
 
 
+def test_pixels_that_change_each_others_light_widen_flux_by_what_a_lattice_shows() -> None:
+    """By the readings of single pixels alone flux held in half of such benches."""
+    talking = coverage(KINDS["pixels that talk"], FEW, 3, parts=(LIGHT,))
+    for region in REGIONS:
+        assert np.mean(talking["flux", region].held) > MIN_HELD, region
+        assert talking["flux", region].ratio < LONGEST, region
+    still = coverage(supposed, 2, 3, parts=(LIGHT,))
+    for region in REGIONS:
+        wide, narrow = talking["flux", region].standard, still["flux", region].standard
+        assert min(wide) > min(narrow), region
+
+
 def test_places_seen_through_an_unstated_lens_are_not_assessed_and_a_stated_one_counts() -> None:
     own_lens = KINDS["tracker's own lens"]
     unstated = coverage(own_lens, 2, 5, tables="")
@@ -140,13 +154,17 @@ def test_places_seen_through_an_unstated_lens_are_not_assessed_and_a_stated_one_
         assert np.mean(counted.held) > MIN_HELD, where
 
 
+# In one reading's noise; the structure that is planted has a hundred times more.
+UNLIKELY_VARIANCE = 0.003
+
+
 def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
     rng = np.random.default_rng(8)
     x, y = (part.ravel() * 20.0 for part in np.meshgrid(np.arange(50.0), np.arange(40.0)))
     terms = np.stack([np.ones_like(x), x / 500 - 1, y / 400 - 1], axis=1)[None]
     noise = rng.standard_normal((1, len(x)))
     found = in_place(x, y, noise, terms)
-    assert found.total == 0
+    assert found.total < UNLIKELY_VARIANCE
     assert found.noise_variance == pytest.approx(1, abs=4 * math.sqrt(2 / len(x)))
     more = noise + math.sqrt(0.3) * SmoothField(80.0, rng)(x, y)
     found = in_place(x, y, more, terms)
@@ -190,6 +208,18 @@ def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:
             assert sorted(found[f"place_{axis}", region].standard)[-2] < 0.02
     for where, counted in found.items():
         assert max(abs(np.array(counted.error)) / np.array(counted.standard)) < 5, where
+
+
+def test_all_of_a_dots_light_counts_however_faint_it_is() -> None:
+    """Of the pixels above a threshold that of a dot of half the light was a smaller share."""
+    row, column = np.mgrid[:60, :60]
+    places = np.array([[15.2, 14.8], [15.0, 44.6], [45.4, 30.0]])
+    light = np.array([1.0, 0.5, 0.02])
+    image = np.zeros((60, 60))
+    for (y, x), total in zip(places, light, strict=True):
+        spot = np.exp(-((row - y) ** 2 + (column - x) ** 2) / 2)
+        image += total * spot / spot.sum()
+    assert light_in_squares(image, places[:, 1], places[:, 0], 6) == pytest.approx(light, rel=1e-6)
 
 
 LENS = "true-lens.toml"
@@ -330,6 +360,26 @@ def test_of_two_readings_of_a_faint_code_the_darker_counts_as_much(tmp_path) -> 
         file, LightReadings(codes, light, np.zeros(len(codes)), noise=noise)
     )
     assert deviation.value[0] == pytest.approx(1, abs=1e-4)
+
+
+def test_what_readings_share_is_no_larger_where_a_faint_code_reads_nothing(tmp_path) -> None:
+    """Relative to a reading of no light it was a billion times too large, and so all intervals."""
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+    )
+    file = read_bench_file(path)
+    lit = [1, 20, 80, 160, 255]
+    codes = np.array([0, *lit, 0, *lit, 0, 0])
+    light = 1e3 + grey_response(file).light[codes] * WHITE_E_PER_S
+    light[codes == 0] += [1.0, -1.0, 1.0, -1.0]
+    light[codes == 1] = [999.0, 1001.0]
+    light[codes > 1] *= 1 + 1e-6 * np.resize([1, -1], int((codes > 1).sum()))
+    shared_e_per_s = np.where(codes == 0, 0.0, 2.0)[:, None]
+    readings = LightReadings(codes, light, np.zeros(len(codes)), common=shared_e_per_s)
+    deviation = light_deviation(file, readings)
+    expected = grey_response(file).light[lit] * WHITE_E_PER_S
+    assert deviation.common_factors[:, 0] == pytest.approx(2.0 / expected)
 
 
 def test_three_readings_hold_the_truth_by_their_t() -> None:

@@ -18,11 +18,13 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.resources import resource_path
 from hilstar.optics.glass import prescription
 from hilstar.optics.glass.codev_file import read_codev
+from hilstar.optics.glass.lens_data import FieldPoint
 from hilstar.optics.glass.psf_file import Glass, read_glass
 from hilstar.optics.glass.zemax_file import read_zemax
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.lenses import SCHOTT, focal_length_mm, lit_share, rms_radius_um, seq, zmx
+from tests.support.refusals import refusal
 
 SIZE, PITCH_UM = "101,81", 20.0
 # Measured: 0.002 px and 0.7 %; diffraction's wings beyond the stamp are what is left.
@@ -498,3 +500,36 @@ def test_the_camera_of_chief_rays_has_browns_coefficients_of_its_rays():
     assert camera.lens.tangential == pytest.approx((p1, p2), rel=1e-6)
     on_axis = SimpleNamespace(max_field=0, focal_length_mm=40.0)
     assert prescription._Chiefs.of(on_axis) == prescription._Chiefs(40.0, None)
+
+
+def test_vignetting_is_that_of_the_field_s_own_direction():
+    """One lens that cuts 0.2 off along each field's direction and 0.05 across it, 0.1 nearer to
+    the axis; and a field beside both axes with a smaller round pupil.
+    """
+    points = (
+        FieldPoint(0.0, 0.0),
+        FieldPoint(0.0, 1.0, compression=(0.05, 0.2), shift=(0.0, -0.1)),
+        FieldPoint(0.0, -2.0, compression=(0.05, 0.2), shift=(0.0, 0.1)),
+        FieldPoint(3.0, 0.0, compression=(0.2, 0.05), shift=(-0.1, 0.0)),
+        FieldPoint(-4.0, 0.0, compression=(0.2, 0.05), shift=(0.1, 0.0)),
+        FieldPoint(3.0, 4.0, compression=(0.3, 0.3)),
+        FieldPoint(6.0, 8.0),
+    )
+    alike = [0.05, 0.2, -0.1]
+    wanted = [[0, 0, 0, 0], *([radius, *alike] for radius in (1, 2, 3, 4))]
+    wanted += [[5, 0.3, 0.3, 0], [10, 0, 0, 0]]
+    assert pytest.approx(np.array(wanted)) == prescription._vignetting(points).T
+
+
+@pytest.mark.parametrize(
+    "point",
+    [
+        FieldPoint(1.0, 1.0, compression=(0.1, 0.2)),
+        FieldPoint(1.0, 1.0, compression=(0.1, 0.1), shift=(0.0, 0.1)),
+        FieldPoint(0.0, 1.0, shift=(0.1, 0.0)),
+        FieldPoint(1.0, 0.0, shift=(0.0, 0.1)),
+    ],
+)
+def test_vignetting_beside_a_field_s_direction_is_refused(point):
+    line = refusal(prescription._vignetting, (point,))
+    assert f"{point.x:g}, {point.y:g} is vignetted along neither x nor y" in line

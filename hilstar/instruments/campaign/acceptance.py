@@ -23,6 +23,7 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     CostOfSet,
     SetResult,
 )
+from hilstar.instruments.campaign.case_table import Columns, read_cases
 from hilstar.instruments.campaign.figures import TooFewCases
 from hilstar.instruments.campaign.requirements import (
     NOT_SHOWN,
@@ -30,7 +31,6 @@ from hilstar.instruments.campaign.requirements import (
     judged_figure,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import Columns, read_cases
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.star_motion import with_motion

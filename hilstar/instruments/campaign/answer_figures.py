@@ -25,6 +25,7 @@ from scipy import optimize, stats
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.instruments.campaign.case_table import VARY, Columns
 from hilstar.instruments.campaign.cases import (
     AXES,
     FALSE_STARS,
@@ -38,7 +39,6 @@ from hilstar.instruments.campaign.cases import (
 from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
 from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
 from hilstar.instruments.campaign.planted import aberration_rad
-from hilstar.instruments.campaign.results import VARY, Columns
 from hilstar.instruments.campaign.star_motion import YEARLY_TURN, YEARS
 from hilstar.optics.camera import field_terms
 

@@ -37,6 +37,7 @@ from hilstar.instruments.assess.budget import Decomposed, assess_cases
 from hilstar.instruments.assess.components import HARMONICS, SURE_OF_MANY, Component
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.answer_figures import answer_figure
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.figures import (
     BoundedFigure,
     TooFewCases,
@@ -52,7 +53,7 @@ from hilstar.instruments.campaign.plan import (
     Require,
     checked_conditions,
 )
-from hilstar.instruments.campaign.results import MAX_FITTED_CASES, Columns, attitudes_of
+from hilstar.instruments.campaign.results import MAX_FITTED_CASES, attitudes_of
 
 AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {

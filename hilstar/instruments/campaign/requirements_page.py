@@ -37,6 +37,7 @@ from hilstar.basics.pages import (
 )
 from hilstar.basics.version import __version__
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import VARY, Columns, read_cases
 from hilstar.instruments.campaign.plan import CONDITION, QUANTITY_UNITS, Plan
 from hilstar.instruments.campaign.requirements import (
     MET,
@@ -45,7 +46,6 @@ from hilstar.instruments.campaign.requirements import (
     RequirementVerdict,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import VARY, Columns, read_cases
 from hilstar.instruments.campaign.star_motion import with_motion
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.server.bench.alignment import cube_to_boresight

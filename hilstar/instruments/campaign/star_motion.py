@@ -14,8 +14,8 @@ from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import VARY, Columns
 from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
-from hilstar.instruments.campaign.results import VARY, Columns
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.config.bench_config import jyear
 from hilstar.server.bench.star_light import catalogue_choice

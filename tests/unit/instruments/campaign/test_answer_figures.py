@@ -13,6 +13,7 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.answer_figures import fit_by_cases
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import (
     FRAME_ERRORS,
     FRAME_RATE_ERRORS,
@@ -28,7 +29,6 @@ from hilstar.instruments.campaign.requirements import (
     RequirementVerdict,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import Columns
 
 SCALE = Scale(1500.0, (512, 512))
 CASES, FRAMES = 60, 8

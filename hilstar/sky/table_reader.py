@@ -131,6 +131,8 @@ COLUMNS_WANTED = (
     "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag"
     " with bp_rp or with phot_bp_mean_mag and phot_rp_mean_mag"
 )
+# The roles whose figures are identifiers.
+WHOLE = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
 MAX_NAMED = 12
 HOURS = ("h", "hr", "hrs", "hour", "hours", "hourangle")
 IN_RADIANS = ("rarad", "derad")
@@ -394,10 +396,6 @@ class RawTable:
     unit: Mapping[str, str | None]
     row_count: int
     notices: tuple[str, ...] = ()
-
-
-# The roles whose figures are identifiers.
-WHOLE = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
 
 
 def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawTable:

@@ -65,29 +65,6 @@ STRIPE_NOTE = (
     " the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
 )
 WHOLE_PT = 5.0  # width of the lines of whole refreshes: another line lies on them
-
-
-def is_whole(point: "StripePoint") -> bool:
-    """Whether a row's exposure is of whole refreshes."""
-    return float(point.refreshes).is_integer()
-
-
-STRIPE_PANEL = PanelSpec(
-    (
-        LineSpec("row", "foretold", where=is_whole, look={"lw": WHOLE_PT}),
-        LineSpec("row", "foretold", where=lambda point: not is_whole(point)),
-        LineSpec("row", "light", "", marker="o", named=False, look={"ms": 3}),
-    ),
-    "light / mean light",
-    "row of the tracker",
-    from_zero=True,
-    legend={
-        "loc": "upper center",
-        "bbox_to_anchor": (0.5, -0.16),
-        "ncols": 2,
-        "frameon": False,
-    },
-)
 RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
 PACKET_HZ = 200
 RATE_DEG_S = 1.0
@@ -114,6 +91,29 @@ START_S = 0.0037  # exposure start within a refresh period
 REFRESH_MS = 1e3 / 60  # the default of a bench file
 FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
 COST_ROUNDS = 9  # of which the median counts
+
+
+def is_whole(point: "StripePoint") -> bool:
+    """Whether a row's exposure is of whole refreshes."""
+    return float(point.refreshes).is_integer()
+
+
+STRIPE_PANEL = PanelSpec(
+    (
+        LineSpec("row", "foretold", where=is_whole, look={"lw": WHOLE_PT}),
+        LineSpec("row", "foretold", where=lambda point: not is_whole(point)),
+        LineSpec("row", "light", "", marker="o", named=False, look={"ms": 3}),
+    ),
+    "light / mean light",
+    "row of the tracker",
+    from_zero=True,
+    legend={
+        "loc": "upper center",
+        "bbox_to_anchor": (0.5, -0.16),
+        "ncols": 2,
+        "frameon": False,
+    },
+)
 
 
 @dataclass(frozen=True, slots=True)
